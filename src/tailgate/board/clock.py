@@ -9,13 +9,15 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Generic
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.provenance import commit, processor
 from tailgate.base.version import VERSION
-from tailgate.core import draws, no_command
+from tailgate.core import Array, Defence, Estimate, Received, draws, no_command
+from tailgate.core.components import P, S
+from tailgate.core.draws import Draws
 from tailgate.core.loop import Loop
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_scenario
@@ -26,10 +28,10 @@ ROUNDS, MOST = 5, 200  # episodes of each defence that count; steps of an episod
 Progress = Callable[[int, int], None]
 
 
-class _Timed:
-    """A defence that keeps how long each of its steps took [ns]."""
+class Timed(Generic[P, S]):
+    """A defence that records the time of each of its steps [ns]."""
 
-    def __init__(self, defence: Any) -> None:
+    def __init__(self, defence: Defence[P, S]) -> None:
         self.defence = defence
         self.taken: list[int] = []
 
@@ -38,14 +40,14 @@ class _Timed:
             raise AttributeError(name)
         return getattr(self.defence, name)
 
-    def step(self, *arguments: Any) -> Any:
+    def step(self, plan: P, state: S, received: Received, known_u: Array, draws: Draws) -> tuple[S, Estimate]:
         began = time.perf_counter_ns()
-        answer = self.defence.step(*arguments)
+        answer = self.defence.step(plan, state, received, known_u, draws)
         self.taken.append(time.perf_counter_ns() - began)
         return answer
 
 
-def _round(loop: Loop, timed: _Timed, seed: int) -> float:
+def _round(loop: Loop, timed: Timed, seed: int) -> float:
     """Return the median time of the first steps of a clean episode [us]."""
     timed.taken.clear()
     state, nothing = loop.start(draws.keys("calibrate", [seed])), no_command(1, loop.model.agents, len(loop.model.wires))
@@ -64,11 +66,11 @@ def measure(suite: Suite, defences: Sequence[str] = (), *, rounds: int = ROUNDS,
     """
     sizes.check("rounds", rounds)
     place = load_scenario(suite.scenarios[0])
-    seats: dict[str, tuple[Loop, _Timed]] = {}
+    seats: dict[str, tuple[Loop, Timed]] = {}
     for text in dict.fromkeys(defences or suite.defences):
         spec = Spec("defence", text)
         spec.refuse_imports("step times")
-        timed = _Timed(spec.make())
+        timed = Timed(spec.make())
         try:
             loop = place.loop(timed, spec.entry.uses)
             _round(loop, timed, 0)

@@ -7,7 +7,6 @@ import lzma
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from tailgate.base.errors import InputError
 from tailgate.base.reading import lines_of, parse_json
@@ -86,7 +85,9 @@ def _one_round(folder: Path, beacon: str) -> None:
             raise InputError(f"beacon of {path}", held, f"{beacon!r}, as asked for now: use another folder for another round")
 
 
-def board_of(suite: Suite, folder: Path, beacon: str | None = None, keep: bool = False, **options: Any) -> Data:
+def board_of(
+    suite: Suite, folder: Path, beacon: str | None = None, keep: bool = False, *, require_adaptive: bool = True
+) -> Data:  # fmt: skip
     """Score all rows in a folder, with verified/*.json and the bounds of trust/trust.json, and write board.json. Returns the board.
 
     Fields of an earlier board.json that do not come from rows are kept (`with_kept`). With `keep` entries are kept too that have no rows,
@@ -102,7 +103,7 @@ def board_of(suite: Suite, folder: Path, beacon: str | None = None, keep: bool =
         raise InputError("rows: version", min(other), f"{VERSION}, as the board's")
     board = score(
         (row for rows in parts.values() for row in rows), suite, attacks=list_of(suite, folder / LIST),
-        board=before if keep else None, **options,
+        board=before if keep else None, require_adaptive=require_adaptive,
     )  # fmt: skip
     if beacon is not None and board["suite"]["beacon"] != beacon:
         raise InputError("beacon", beacon, f"that of the rows, {board['suite']['beacon'] or 'which are of public seeds'}")

@@ -222,7 +222,7 @@ def _play_part(part: Path, split: str, cell: Cell, loop: Loop, attack: Attack, c
             writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=count)
 
 
-def _array(pa: ModuleType, field: Any, value: Any, count: int) -> Any:
+def _array(pa: ModuleType, field: Any, value: str | Array, count: int) -> Any:
     if not isinstance(value, np.ndarray):
         return pa.array([value] * count, field.type)
     return pa.array(value, field.type, mask=np.isnan(value) if field.nullable else None)
@@ -232,7 +232,7 @@ def steps(loop: Loop, attack: Attack, keys: draws.Keys) -> Iterator[tuple[LoopSt
     """Yield each step of B episodes: the state before it, its frame, the innovation (B, N, q), NaN if none, and live (B,) bool."""
     state = loop.start(keys)
     plan = attack.prepare(loop.brief)
-    memory: Any = attack.start(plan, len(keys.key), keys.at(Role.ATTACK, np.zeros(len(keys.key), np.int64)))
+    memory = attack.start(plan, len(keys.key), keys.at(Role.ATTACK, np.zeros(len(keys.key), np.int64)))
     while int(state.k[0]) <= loop.horizon and not state.ended.all():
         live, before = ~state.ended, duplicate(state.defence)
         held = state._replace(defence=before)

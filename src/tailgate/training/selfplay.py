@@ -17,11 +17,10 @@ A member is trained for certain opponents: a run that goes on trains again what 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import itertools
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -163,19 +162,15 @@ class Game:
     def _run(self) -> dict[str, Any]:
         defenders, attackers = [self._as_it_is()], []
         for r in range(1, self.config.rounds + 1):
-            pool = self._defence(policy=tuple(defenders))
+            pool = replace(self.duel.guard, policy=tuple(defenders))
             attackers.append(self._attacker(f"attacker-{r}", self.config.first_seed + r, pool))
             defenders.append(self._defender(r, tuple(PolicyAttack(path) for path in attackers)))
-        frozen = self._defence(policy=defenders[-1])
+        frozen = replace(self.duel.guard, policy=defenders[-1])
         setting = self._best_setting(tuple(PolicyAttack(path) for path in attackers))
-        fixed = self._defence(setting=setting)
+        fixed = replace(self.duel.guard, setting=setting)
         fresh = [self._fresh(f"fresh-{i}", i, frozen) for i in range(self.config.fresh)]
         other = [self._fresh(f"fresh-fixed-{i}", i, fixed) for i in range(self.config.fresh)]
-        return self._report({AS_IS: self._defence(), FIXED: fixed, TRAINED: frozen}, attackers, fresh, other, setting)
-
-    def _defence(self, **who: Any) -> Steered:
-        """Return the defence in certain hands: a policy's, or those of a fixed setting."""
-        return dataclasses.replace(self.duel.guard, **who)
+        return self._report({AS_IS: self.duel.guard, FIXED: fixed, TRAINED: frozen}, attackers, fresh, other, setting)
 
     def _as_it_is(self) -> Path:
         path, setting = self.directory / "defender-0", nearest(self.duel.guard.hand.knobs)
@@ -238,8 +233,8 @@ class Game:
 
     def _play(self, defence: Steered, attack: Attack, purpose: str, episodes: int) -> Played:
         """Play the first episodes of a pair on seeds of a purpose."""
-        seat = dataclasses.replace(self.duel.seat, loop=dataclasses.replace(self.duel.seat.loop, defence=defence))
-        duel = dataclasses.replace(self.duel, seat=seat, guard=defence)
+        seat = replace(self.duel.seat, loop=replace(self.duel.seat.loop, defence=defence))
+        duel = replace(self.duel, seat=seat, guard=defence)
         parts = [play(duel, attack, draws.keys(purpose, range(at, min(at + BATCH, episodes)))) for at in range(0, episodes, BATCH)]
         paid, crashed, cost = (np.concatenate([getattr(part, name) for part in parts]) for name in ("paid", "crashed", "cost"))
         return Played(paid, crashed, cost, sum(part.decisions for part in parts))

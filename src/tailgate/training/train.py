@@ -162,9 +162,9 @@ def check(config: TrainConfig) -> None:
     cells_of(suite_of(config, (*config.rivals, *config.white_box)), threat=config.threat)
 
 
-def _check_memory(config: TrainConfig, settings: Any, seat: Seat) -> None:
+def _check_memory(config: TrainConfig, settings: Config, seat: Seat) -> None:
     """Raise InputError where the environments side by side, and the decisions that a learner keeps, take more memory than is free."""
-    rows = settings.envs if hasattr(settings, "envs") else settings.population * settings.episodes
+    rows = getattr(settings, "envs", 0) or getattr(settings, "population", 0) * getattr(settings, "episodes", 0)
     kept = max(rows * getattr(settings, "rollout", 0), getattr(settings, "buffer_size", 0))
     side_by_side, seen = min(config.workers, config.seeds), 16 * len(seat.observation.names)  # bytes: before and after, and half for copies
     needed = side_by_side * (rows * seat.memory + kept * (seen + 64))
