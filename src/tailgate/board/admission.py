@@ -92,7 +92,7 @@ def admit(
     for defence in defences:
         worst = Worst(table, defence, level, alpha)
         played = [k for k, pair in enumerate(worst.pairs) if pair not in worst.lost]
-        mine = [k for k in played if table.columns[worst.pairs[k][1]].attack == attack]
+        mine = [k for k in played if table.attackers[worst.pairs[k][1]].attack == attack]
         others = [k for k in played if k not in mine]
         best = max(others, key=lambda k: float(worst.shares[k, 0]), default=None)
         for k in mine:

@@ -65,14 +65,14 @@ def measure(suite: Suite, defences: Sequence[str] = (), *, rounds: int = ROUNDS,
     unregistered class. The same goes for a named one that means nothing there, and if none is left.
     """
     sizes.check("rounds", rounds)
-    place = load_scenario(suite.scenarios[0])
+    scenario = load_scenario(suite.scenarios[0])
     seats: dict[str, tuple[Loop, Timed]] = {}
     for text in dict.fromkeys(defences or suite.defences):
         spec = Spec("defence", text)
         spec.refuse_imports("step times")
         timed = Timed(spec.make())
         try:
-            loop = place.loop(timed, spec.entry.uses)
+            loop = scenario.loop(timed, spec.entry.uses)
             _round(loop, timed, 0)
         except NotApplicable:
             if defences:
@@ -80,7 +80,7 @@ def measure(suite: Suite, defences: Sequence[str] = (), *, rounds: int = ROUNDS,
             continue
         seats[text] = loop, timed
     if not seats:
-        raise InputError("defences", list(suite.defences), f"one that means something in {place.name}")
+        raise InputError("defences", list(suite.defences), f"one that means something in {scenario.name}")
     taken: dict[str, list[float]] = {text: [] for text in seats}
     for seed in range(1, rounds + 1):
         for i, (text, (loop, timed)) in enumerate(seats.items()):
@@ -93,6 +93,6 @@ def measure(suite: Suite, defences: Sequence[str] = (), *, rounds: int = ROUNDS,
     ]
     model = next(iter(seats.values()))[0].model
     return Clock(
-        suite=suite.name, scenario=place.name, agents=model.agents, rounds=rounds, processor=processor(),
+        suite=suite.name, scenario=scenario.name, agents=model.agents, rounds=rounds, processor=processor(),
         version=VERSION, commit=commit(), entries=entries,
     )  # fmt: skip

@@ -66,9 +66,9 @@ def plants(scenarios: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """
     out: dict[tuple[str, tuple[int, ...]], list[str]] = {}
     for name in scenarios:
-        place = load_scenario(name)
-        model = place.brief().model
-        out.setdefault((type(place.plant).__name__, (model.agents, model.states, len(model.sensors))), []).append(name)
+        scenario = load_scenario(name)
+        model = scenario.brief().model
+        out.setdefault((type(scenario.plant).__name__, (model.agents, model.states, len(model.sensors))), []).append(name)
     kinds = [kind for kind, _ in out]
     shape = "{} of {} agents with {} states and {} readings each"
     return {kind if kinds.count(kind) == 1 else shape.format(kind, *size): tuple(names) for (kind, size), names in out.items()}
@@ -91,9 +91,9 @@ class Found(NamedTuple):
     rarer: bool = False
 
 
-def _found(defence: str, places: tuple[str, ...], hours: float, effort: Effort) -> Found:
+def _found(defence: str, scenarios: tuple[str, ...], hours: float, effort: Effort) -> Found:
     try:
-        made = threshold(defence, places, float(hours), effort.onsets, effort.most_steps)
+        made = threshold(defence, scenarios, float(hours), effort.onsets, effort.most_steps)
     except InputError as error:
         if error.field != "hours":
             raise

@@ -64,13 +64,13 @@ def _of(table: Table, defence: str, scenario: str) -> list[Gate]:
     ]
 
 
-def _false_alarms(table: Table, scenario: str, own: list[Row]) -> Gate:
+def _false_alarms(table: Table, name: str, own: list[Row]) -> Gate:
     """Return the gate that fails an alarm which is on more than off, if the detection board has no threshold for it."""
     share = float(np.mean([row["alarm_rate"] for row in own]))
-    place = table.scenarios[scenario]
+    scenario = table.scenarios[name]
     onsets = sum(row["alarm_onsets"] for row in own)
-    often = onsets * HOURS * HOUR > len(own) * place.horizon * place.brief().model.dt
-    return _gate("false alarms", scenario, share, ALARMED, not (share > ALARMED and often))
+    often = onsets * HOURS * HOUR > len(own) * scenario.horizon * scenario.brief().model.dt
+    return _gate("false alarms", name, share, ALARMED, not (share > ALARMED and often))
 
 
 def _worse(of: Callable[[float, float], float], values: list[float]) -> float | None:

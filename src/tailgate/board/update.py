@@ -13,7 +13,7 @@ from tailgate.core.threat import KNOWLEDGE
 from tailgate.evaluation.rows import CLEAN
 
 from .cells import cells_of, compared, joined, place_of, table_of
-from .damage import Column, Table
+from .damage import Attacker, Table
 from .files import amended, read_board
 from .schema import DETECTION, Board, Data
 from .worst import Worst
@@ -73,7 +73,7 @@ def kept_part(table: Table, board: Data, suite: Suite, alpha: float, require_ada
             raise InputError(f"rows of {name}: seeds", f"{len(table.seeds.get(name, ()))} of them", f"the board's, which are {len(seeds)}")
     if other := ({*held.listed} - held.withdrawn) ^ ({*held.listed} & {*table.listed} - table.withdrawn):
         raise InputError("board: attacks", min(other), "the list of attacks that is here: play the whole suite")
-    files = {key.column.attack: rows[0]["attack_digest"] for key, rows in table.cells.items()}
+    files = {key.attacker.attack: rows[0]["attack_digest"] for key, rows in table.cells.items()}
     entries: dict[str, Data] = {}
     cells: list[Data] = []
     added: dict[str, frozenset[str]] = {}
@@ -107,20 +107,20 @@ def kept_part(table: Table, board: Data, suite: Suite, alpha: float, require_ada
     for name in entries:
         before, now = _counted(held, name), _counted(both, name)
         if odd := {pair for pair in before ^ now if pair in before or pair[1].attack not in added.get(name, ())}:
-            where, column, _ = min(odd)
+            where, attacker, _ = min(odd)
             wanted = f"an attack that counts against {name} as before: play the whole suite"
-            raise InputError(f"rows of {column.attack} on {where}", "played", wanted)
+            raise InputError(f"rows of {attacker.attack} on {where}", "played", wanted)
     own = sum(len(rows) for rows in both.cells.values())
     whole = dataclasses.replace(both, rows=own + sum(len(held.seeds[c["scenario"]]) for c in cells))
     return KeptPart(board, whole, entries, cells, held, added, frozenset(steady))
 
 
-def _counted(table: Table, defence: str) -> set[tuple[str, Column, bool]]:
-    """Return scenario and column of every attack that counts against a defence, and if its figures are whole."""
+def _counted(table: Table, defence: str) -> set[tuple[str, Attacker, bool]]:
+    """Return scenario and attacker of every attack that counts against a defence, and if its figures are whole."""
     if defence not in table.defences:
         return set()
     worst = Worst(table, defence, KNOWLEDGE[-1], 0.05)
-    return {(name, table.columns[i], (name, i) in worst.lost) for name, i in worst.pairs}
+    return {(name, table.attackers[i], (name, i) in worst.lost) for name, i in worst.pairs}
 
 
 def _said(places: list[tuple[Any, ...]]) -> str:

@@ -101,11 +101,11 @@ def dose_response(
             played = [held[defence, "none", 0], *(held[defence, attack, dose] for dose in steps)]
             curves.append(_curve(attack, defence, played, [0, *steps], counted, exceeds, limit))
     curves += [{"attack": attack, "defence": defence, "skipped": why} for defence in against for attack, why in reasons.items() if why]
-    place = load_scenario(scenario).with_threat(**threat)
+    loaded = load_scenario(scenario).with_threat(**threat)
     return {
         "measure": "dose-response", "scenario": scenario, "purpose": purpose, "episodes": episodes, "outcome": counted,
-        "unit": "0/1" if share else unit_in(counted, place.brief().model), "exceeds": exceeds, "limit": limit, "doses": [0, *steps],
-        "threat": as_data(threat), "threat_model": as_data(place.threat_model), "curves": curves,
+        "unit": "0/1" if share else unit_in(counted, loaded.brief().model), "exceeds": exceeds, "limit": limit, "doses": [0, *steps],
+        "threat": as_data(threat), "threat_model": as_data(loaded.threat_model), "curves": curves,
     }  # fmt: skip
 
 

@@ -164,10 +164,11 @@ def _written(
         "attacks": list(chosen.attacks), "defences": list(chosen.defences), "doses": list(chosen.doses), "files": files, "skipped": skipped,
         "scenarios": {
             name: {
-                "about": place.about, "config_hash": place.config_hash, "dt": model.dt, "horizon": place.horizon, "agents": model.agents,
+                "about": scenario.about, "config_hash": scenario.config_hash, "dt": model.dt,
+                "horizon": scenario.horizon, "agents": model.agents,
                 "columns": [column._asdict() for column in described],
             }
-            for name, (place, model, described) in columns.items()
+            for name, (scenario, model, described) in columns.items()
         },
     }  # fmt: skip
     write_atomic(folder / "README.md", readme(held).encode())

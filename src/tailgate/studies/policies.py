@@ -186,9 +186,9 @@ def check_episodes(episodes: int) -> None:
 
 def loop_for(who: Trained, scenario: str, defence: str, threat: dict[str, Any], dose: int | None = None) -> Loop:
     """Return the loop that a policy is played in, with the knowledge that it was trained with."""
-    place = Cell("", scenario, dose, defence, who.text, 1, threat=threat).place(who.policy, who.header.knowledge)
+    cell = Cell("", scenario, dose, defence, who.text, 1, threat=threat)
     spec = Spec("defence", defence)
-    loop = place.loop(spec.make(), spec.entry.uses)
+    loop = cell.place(who.policy, who.header.knowledge).loop(spec.make(), spec.entry.uses)
     who.policy.prepare(loop.brief)  # refuses a policy of another layout here
     return loop
 

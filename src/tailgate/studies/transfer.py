@@ -83,8 +83,8 @@ def transfer(
             skipped.append({"policy": who.name, "trained_on": origins[who.text], "reason": reason})
         else:
             good.append(who)
-    rivals = ("none", *(who.text for who in good))
-    cells = cells_of(Suite("transfer", "", (where,), (dose,), columns, rivals, episodes, changed), purpose=purpose)
+    attacks = ("none", *(who.text for who in good))
+    cells = cells_of(Suite("transfer", "", (where,), (dose,), columns, attacks, episodes, changed), purpose=purpose)
     rows = run(cells, rows_file, workers, progress)
     held: dict[tuple[str, str], Array] = {}
     for i, cell in enumerate(cells):
@@ -119,10 +119,10 @@ def transfer(
                 gain = difference(values, own, is_share(counted))
                 entry |= {"over_own": gain._asdict(), "flags": ["transferred beats own"] if gain.low > 0.0 else []}
             entries.append(entry)
-    place = load_scenario(where).with_threat(**(changed | ({} if dose is None else {"budget": dose})))
+    loaded = load_scenario(where).with_threat(**(changed | ({} if dose is None else {"budget": dose})))
     return {
         "measure": "transfer", "scenario": where, "purpose": purpose, "episodes": episodes, "outcome": counted,
-        "unit": unit_in(counted, place.brief().model), "threat_model": as_data(place.threat_model),
+        "unit": unit_in(counted, loaded.brief().model), "threat_model": as_data(loaded.threat_model),
         "trained_on": list(origin_rows), "played_on": list(columns),
         "no_attack": {column: float(held["none", column].mean()) for column in columns if ("none", column) in held},
         "entries": entries, "skipped": skipped,

@@ -74,13 +74,13 @@ def configs_of(suite: Suite, defence: str, out: Path, *, seeds: int | None = Non
     settings = [f"defence={json.dumps(defence)}", f"out={json.dumps(str(out))}", "tensorboard=false"]
     settings += ["others=[]", "white_box=[]", f"seeds={seeds or plan.seeds}"]
     found = []
-    for place in plan.scenarios or suite.scenarios[:1]:
-        tag = f"-{place}" if len(plan.scenarios) > 1 else ""
+    for scenario in plan.scenarios or suite.scenarios[:1]:
+        tag = f"-{scenario}" if len(plan.scenarios) > 1 else ""
         for learner, changes in plan.learners.items():
             for knowledge in plan.knowledge:
                 name = f"{stem(defence)}-{learner}-{knowledge}{tag}"
                 granted = f"threat={json.dumps(threat | {'knowledge': knowledge})}"
-                own = [f"name={name}", f"learner={learner}", f"scenario={place}", *settings, granted, *plan.changes, *changes, *extra]
+                own = [f"name={name}", f"learner={learner}", f"scenario={scenario}", *settings, granted, *plan.changes, *changes, *extra]
                 found.append(train.load_config(plan.config, own))
     return found
 

@@ -185,8 +185,8 @@ def propose(trial: Trial, space: Space) -> dict[str, Any]:
 def objective(config: TrainConfig, policy: Path, episodes: int) -> float:
     """Return the mean outcome of a policy against the defence that it was trained on, on the purpose `tune`."""
     attack, spec, outcome = PolicyAttack(policy), Spec("defence", config.defence), outcome_of(config)
-    place = Cell("tune", config.scenario, None, config.defence, str(policy), episodes, "tune", threat=config.threat).place(attack, "black")
-    loop = place.loop(spec.make(), spec.entry.uses)
+    cell = Cell("tune", config.scenario, None, config.defence, str(policy), episodes, "tune", threat=config.threat)
+    loop = cell.place(attack, "black").loop(spec.make(), spec.entry.uses)
     size = episodes_at_once(loop.model, loop.horizon, BATCH)
     parts = [range(start, min(start + size, episodes)) for start in range(0, episodes, size)]
     return float(np.concatenate([METRICS[outcome](rollout(loop, attack, draws.keys("tune", part))) for part in parts]).mean())
