@@ -98,8 +98,8 @@ def cells_of(table: Table) -> list[Data]:
     ], table)  # fmt: skip
 
 
-def place_of(cell: Data) -> tuple[Any, ...]:
-    """Return the key that tells a cell from the others of its board."""
+def cell_key(cell: Data) -> tuple[Any, ...]:
+    """Return the key of a cell, which no other cell of its board has."""
     return cell["scenario"], cell["dose"], cell["defence"], cell["attack"], cell["knowledge"]
 
 

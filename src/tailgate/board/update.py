@@ -12,7 +12,7 @@ from tailgate.core.scenario import Suite
 from tailgate.core.threat import KNOWLEDGE
 from tailgate.evaluation.rows import CLEAN
 
-from .cells import cells_of, compared, joined, place_of, table_of
+from .cells import cell_key, cells_of, compared, joined, table_of
 from .damage import Attacker, Table
 from .files import amended, read_board
 from .schema import DETECTION, Board, Data
@@ -65,9 +65,9 @@ def kept_part(table: Table, board: Data, suite: Suite, alpha: float, require_ada
     for attack in board["attacks"]:
         if (line := attack.get("admitted")) and (digest := digests.get(attack["attack"], line["digest"])) != line["digest"]:
             raise InputError(f"board: digest of {attack['attack']}", line["digest"], f"{digest}, as on the list: play the whole suite")
-    new = {place_of(cell): cell for cell in cells_of(table)}
-    told = {place: cell["hits"] for place, cell in new.items()}
-    held = table_of(board | {"cells": [cell | {"hits": told.get(place_of(cell), cell.get("hits"))} for cell in board["cells"]]}, suite)
+    new = {cell_key(cell): cell for cell in cells_of(table)}
+    hits = {key: cell["hits"] for key, cell in new.items()}
+    held = table_of(board | {"cells": [cell | {"hits": hits.get(cell_key(cell), cell.get("hits"))} for cell in board["cells"]]}, suite)
     for name, seeds in held.seeds.items():
         if table.seeds.get(name, ()) != seeds:
             raise InputError(f"rows of {name}: seeds", f"{len(table.seeds.get(name, ()))} of them", f"the board's, which are {len(seeds)}")
@@ -80,23 +80,23 @@ def kept_part(table: Table, board: Data, suite: Suite, alpha: float, require_ada
     steady: set[str] = set()
     for entry in board["entries"]:
         name = entry["defence"]
-        old = {place_of(cell): cell for cell in board["cells"] if cell["defence"] == name}
-        again = {place: cell for place, cell in new.items() if cell["defence"] == name}
-        for place in (place for place in again if place in old):
-            if off := [field for field in SAME if old[place].get(field) is not None and old[place][field] != again[place][field]]:
-                wanted = f"{old[place][off[0]]}, as the board has it: else play the whole suite"
-                raise InputError(f"rows of {_said([place])}: {off[0]}", again[place][off[0]], wanted)
+        old = {cell_key(cell): cell for cell in board["cells"] if cell["defence"] == name}
+        again = {key: cell for key, cell in new.items() if cell["defence"] == name}
+        for key in (key for key in again if key in old):
+            if off := [field for field in SAME if old[key].get(field) is not None and old[key][field] != again[key][field]]:
+                wanted = f"{old[key][off[0]]}, as the board has it: else play the whole suite"
+                raise InputError(f"rows of {_said([key])}: {off[0]}", again[key][off[0]], wanted)
         steady |= {name} if again.keys() <= old.keys() else set()
-        lost = [place for place, cell in old.items() if place not in again and cell["attack"] not in held.withdrawn]
+        lost = [key for key, cell in old.items() if key not in again and cell["attack"] not in held.withdrawn]
         if again and not lost:
             continue
-        met, more = {cell["attack"] for cell in old.values()}, [place for place in again if place not in old]
-        if late := [place for place in more if place[3] in met]:
+        met, more = {cell["attack"] for cell in old.values()}, [key for key in again if key not in old]
+        if late := [key for key in more if key[3] in met]:
             raise InputError(f"rows of {name}", _said(late), f"rows of all {len(old)} cells that the board has, {_said(lost)} among them")
         entries[name] = entry
         if more:
-            added[name] = frozenset(place[3] for place in more)
-        cells += [cell | {"hits": told[place]} if place in again else cell for place, cell in old.items()]
+            added[name] = frozenset(key[3] for key in more)
+        cells += [cell | {"hits": hits[key]} if key in again else cell for key, cell in old.items()]
     if CLEAN not in table.defences and CLEAN in held.defences and not entries.keys() >= {*table.defences}:
         raise InputError("rows: defence", list(table.defences), f"{CLEAN} too: what a defence costs is measured against it")
     shared = {cell["attack"] for cell in cells} & {cell["attack"] for cell in new.values() if cell["defence"] not in entries}
@@ -123,9 +123,10 @@ def _counted(table: Table, defence: str) -> set[tuple[str, Attacker, bool]]:
     return {(name, table.attackers[i], (name, i) in worst.lost) for name, i in worst.pairs}
 
 
-def _said(places: list[tuple[Any, ...]]) -> str:
-    scenario, dose, defence, attack, _ = places[0]
-    more = f", and {len(places) - 1} more" if len(places) > 1 else ""
+def _said(keys: list[tuple[Any, ...]]) -> str:
+    """Return the first cell in words, and how many more there are."""
+    scenario, dose, defence, attack, _ = keys[0]
+    more = f", and {len(keys) - 1} more" if len(keys) > 1 else ""
     return f"{scenario}, {defence}, {attack}, dose {dose}{more}"
 
 
@@ -148,8 +149,8 @@ def with_kept(board: Data, old: Data) -> Data:
 
 def _unchanged(board: Data, old: Board) -> dict[str, int]:
     """Return defences whose old cells are all on the board as they were, and how many cells they have there."""
-    cells = {place_of(cell): cell for cell in board["cells"]}
-    moved = {part.defence for part in old.cells if (here := cells.get(place_of(part.model_dump()))) is None or compared(part, here).why}
+    cells = {cell_key(cell): cell for cell in board["cells"]}
+    moved = {part.defence for part in old.cells if (here := cells.get(cell_key(part.model_dump()))) is None or compared(part, here).why}
     names = [entry.defence for entry in old.entries if entry.defence not in moved]
     counts = {name: sum(cell["defence"] == name for cell in board["cells"]) for name in names}
     return {name: n for name, n in counts.items() if n}

@@ -21,7 +21,7 @@ from tailgate.core.registry import Spec
 from tailgate.core.schema import as_data
 from tailgate.play.metrics import METRICS, unit_in
 
-from .policies import defence_of, loop_for, mean, outcome_for, place_of, trained
+from .policies import defence_of, loop_for, mean, outcome_for, scenario_of, trained
 from .timing import played
 
 POINTS = 50  # of a learning curve, at most
@@ -63,7 +63,7 @@ def add_policy(policy: Path, name: str, summary: str, *, episodes: int = EPISODE
         raise InputError("zoo.name", name, "a name that is not taken, or --replace")
     who = trained(str(policy))
     header = who.header
-    scenario, record = place_of(who), header.training
+    scenario, record = scenario_of(who), header.training
     curve = record.get("curve", [])
     if not isinstance(curve, list) or not all(isinstance(point, dict) for point in curve):
         raise InputError(f"policy {who.name}.training.curve", curve, "a list of points, a mapping each")

@@ -151,7 +151,7 @@ def _text(value: object) -> str | None:
     return value if isinstance(value, str) else None
 
 
-def place_of(who: Trained, named: str | None = None) -> str:
+def scenario_of(who: Trained, named: str | None = None) -> str:
     """Return the scenario that the user names, or else that of the training: a registered one, as a record shall not choose a file."""
     if named:
         return named

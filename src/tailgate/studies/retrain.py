@@ -16,7 +16,7 @@ from tailgate.evaluation.checks import Finding, again
 from tailgate.training import train
 
 from .collect import packed
-from .policies import Trained, place_of, trained
+from .policies import Trained, scenario_of, trained
 
 Verdict = Literal["same", "differs", "unchecked"]
 
@@ -91,7 +91,7 @@ def _config(who: Trained) -> train.TrainConfig:
     held = record.get("config")
     if not isinstance(held, dict) or who.seed is None:
         raise InputError(where, record.get("seed"), "the configuration and the seed of a training")
-    place_of(who)
+    scenario_of(who)
     config = train.checked({key: value for key, value in held.items() if key != "class"})
     spec = Spec("defence", config.defence)
     recorded = str(record.get("defence_digest", "")), record.get("defence_version", 1)

@@ -24,7 +24,7 @@ from tailgate.evaluation.cells import Cell, cells_of, run
 from tailgate.evaluation.stats import Interval, paired_difference
 from tailgate.play.metrics import unit_in
 
-from .policies import Trained, check_episodes, defence_of, distinct, is_share, mean, misfit, outcome_for, place_of
+from .policies import Trained, check_episodes, defence_of, distinct, is_share, mean, misfit, outcome_for, scenario_of
 
 LEVEL = 0.95
 T = TypeVar("T")
@@ -66,7 +66,7 @@ def transfer(
     members = distinct(texts)
     if not members:
         raise InputError("policies", list(texts), "at least one")
-    where = scenario or _common("scenario", {who.name: place_of(who) for who in members})
+    where = scenario or _common("scenario", {who.name: scenario_of(who) for who in members})
     changed = _common("threat", {who.name: who.threat for who in members}) if threat is None else dict(threat)
     counted = outcome_for(outcome or next((who.outcome for who in members if who.outcome), None), where)
     origins = {who.text: defence_of(who) for who in members}
