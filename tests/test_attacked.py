@@ -48,7 +48,7 @@ def test_one_command_makes_the_whole_board(tmp_path: Path, capsys: pytest.Captur
     before = {path: path.read_bytes() for path in out.glob("**/*") if path.is_file()}
     _run(str(file), "--out", str(out), "--train")
     assert {path: path.read_bytes() for path in out.glob("**/*") if path.is_file()} == before
-    assert "no row was played anew" in capsys.readouterr().err
+    assert "no new row was played" in capsys.readouterr().err
 
 
 def test_rows_of_another_round_are_said_before_anything_is_played(tmp_path: Path) -> None:
@@ -57,7 +57,7 @@ def test_rows_of_another_round_are_said_before_anything_is_played(tmp_path: Path
     file.write_text(TEXT)
     _run(str(file), "--out", str(out), "--unattacked")
     before = {path: path.read_bytes() for path in out.glob("**/*") if path.is_file()}
-    with pytest.raises(InputError, match=r"beacon of .*rows\.jsonl\.xz.*folder of its own"):
+    with pytest.raises(InputError, match=r"beacon of .*rows\.jsonl\.xz.*another folder"):
         _run(str(file), "--out", str(out), "--beacon", "0123456789abcdef0123")
     assert {path: path.read_bytes() for path in out.glob("**/*") if path.is_file()} == before
 

@@ -150,7 +150,7 @@ def test_the_command_writes_the_file_and_the_pages_show_it(board: Data, tmp_path
         entry["rank"] = entry["rank"] if entry["defence"] in ranked else None
     (folder / "board.json").write_text(json.dumps(board))
     assert main(["leaderboard", "timing", "quick-v0", "--out", str(tmp_path), "--defence", "rkf", "--episodes", "20"]) == 0
-    assert not (folder / "timing.json").exists() and "cannot be told" in capsys.readouterr().out
+    assert not (folder / "timing.json").exists() and "undecided" in capsys.readouterr().out
     assert main(["leaderboard", "timing", "quick-v0", "--out", str(tmp_path), "--json", "--episodes", "60"]) == 0
     held = json.loads(capsys.readouterr().out)
     made = Timing.read(folder / "timing.json")
@@ -159,7 +159,7 @@ def test_the_command_writes_the_file_and_the_pages_show_it(board: Data, tmp_path
     pages = {name: (tmp_path / f"page/quick-v0/{name}.html").read_text() for name in (*ranked, "kf")}
     gain = made.entries[1].advantage
     assert f"<b>+{100 * gain.value:.0f} points</b>" in pages["chi2_kf_sparse"] and "At its own times it surely does more" in pages["chi2_kf_sparse"]
-    assert "cannot be told" in pages["rkf"] and 'id="timing"' not in pages["kf"] and "No attacker that was trained against it did damage" in pages["safe_state_brake"]
+    assert "undecided" in pages["rkf"] and 'id="timing"' not in pages["kf"] and "No attacker that was trained against it did damage" in pages["safe_state_brake"]
     assert "yoked equals own" not in (tmp_path / "page/index.html").read_text()
     held["entries"][1]["advantage"] |= {"adjusted": 1.0, "high": 0.05}
     held["entries"][1]["shuffled"] |= {"low": 0.95, "value": 0.96, "high": 0.97}

@@ -10,7 +10,7 @@ import pytest
 
 from tailgate.base.errors import InputError
 from tailgate.board.attachments import Clock, StepTime
-from tailgate.board.clock import _round, _Timed, measure
+from tailgate.board.clock import Timed, _round, measure
 from tailgate.board.run import board_of
 from tailgate.cli import main
 from tailgate.core.registry import Spec
@@ -54,8 +54,8 @@ def test_what_is_timed_is_the_step_of_the_defence_alone() -> None:
     """Two milliseconds more in its step count, and in the controller beside it they do not."""
     place = load_scenario("thesis-ch4-v0")
     loops = {
-        "kf": (place.loop(kf := _Timed(Spec("defence", "kf").make())), kf), "slow": (place.loop(slow := _Timed(Slow())), slow),
-        "beside": (dataclasses.replace(place.loop(one := _Timed(Spec("defence", "kf").make())), controller=Late(place.controller)), one),
+        "kf": (place.loop(kf := Timed(Spec("defence", "kf").make())), kf), "slow": (place.loop(slow := Timed(Slow())), slow),
+        "beside": (dataclasses.replace(place.loop(one := Timed(Spec("defence", "kf").make())), controller=Late(place.controller)), one),
     }  # fmt: skip
     taken = {name: min(_round(loop, timed, seed) for seed in range(3)) for name, (loop, timed) in loops.items()}
     assert taken["slow"] > 2000 > taken["beside"] and taken["kf"] < 2000 and len(kf.taken) == min(place.horizon, 200)

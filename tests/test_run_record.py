@@ -57,7 +57,7 @@ def test_a_run_says_what_it_took(suite: Path, tmp_path: Path, capsys: pytest.Cap
     assert "run: 18 rows played, 0 kept; " in capsys.readouterr().err
     for more in ((), ("--score-only",)):
         _run(suite, tmp_path / "out", *more)
-        assert "run: no row was played anew" in capsys.readouterr().err
+        assert "run: no new row was played" in capsys.readouterr().err
         assert _held(folder) == held and (folder / "board.json").read_bytes() == board
     (folder / "rows.jsonl.xz").unlink()
     assert len(_held(_run(suite, tmp_path / "out"))["commands"]) == 1  # begun anew: nothing was left of it

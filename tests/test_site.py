@@ -254,7 +254,7 @@ def test_a_comparison_by_numbers_is_marked(tmp_path):
     pairs = [row.partition(" measurements ") for row in Outline(text).rows("cells")]
     told = {(before.split()[-1], figures) for before, _, figures in pairs if figures}
     assert {("kf", "42 0 < 0.0001 < 0.0001"), ("undecided", "≤ 42 ≤ 33 ≤ 0.30 ≤ 0.60")} <= told
-    assert "≤ stands where the board does not know" in text
+    assert "≤: the board knows how many episodes came to damage, but not which" in text
     assert "≤ stands" not in build_site([make_board()], tmp_path / "other", replays=False).read_text(encoding="utf-8")
 
 

@@ -73,7 +73,7 @@ def test_attacks_that_joined_later_are_told_from_those_of_the_suite():
     """Of a board of a suite of the package; of another nobody knows."""
     board = json.loads((ROOT / "results/quick-v0/board.json").read_text(encoding="utf-8"))
     told = {line["name"].full.split(" ")[0]: line["admitted"] for line in attacks_of(Suite(read_board(board), "quick-v0"))}
-    assert told["burst_loss"] == "met later, beside the suite" and told["dropout"] == "with the suite" and "p " in told["fdi_ramp"]
+    assert told["burst_loss"] == "met later, outside the suite" and told["dropout"] == "with the suite" and "p " in told["fdi_ramp"]
     board["suite"]["hash"] = "0"
     assert {line["admitted"] for line in attacks_of(Suite(read_board(board), "quick-v0")) if line["name"].full == "burst_loss"} == {"with the suite"}
 

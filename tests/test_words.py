@@ -9,8 +9,15 @@ from pathlib import Path
 import pytest
 
 SOURCE = Path(__file__).parents[1] / "src/tailgate"
-DONE = ("*.py", "base/*.py", "engine/*.py", "play/*.py", "evaluation/*.py", "sandbox/*.py", "replay/*.py")  # grows room by room
+DONE = (  # grows room by room
+    "*.py", "base/*.py", "engine/*.py", "play/*.py", "evaluation/*.py", "sandbox/*.py", "replay/*.py", "board/*.py", "site/*.py", "cli/*.py",
+    "thesis/*.py", "studies/*.py", "training/*.py", "trust/*.py", "bench/*.py",
+)  # fmt: skip
 LATER = {"evaluation/verify.py", "moved.py"}  # moved.py holds earlier names
+RECORDED = {  # their strings are in published boards, and in reports of claims
+    "board/entry.py", "thesis/ch4_theory.py", "thesis/ch5_theory.py", "thesis/ch6_cases.py", "thesis/ch6_loop.py",
+    "thesis/ch7_automata.py", "thesis/ch7_trust.py",
+}  # fmt: skip
 OPENINGS = re.compile(r"(What|Of|Whose|Whether|Whoever)\b")
 DIALECT = re.compile(r"\b(beside|anew|so many|whoever|told|stands|of (its|his|their) own)\b", re.IGNORECASE)
 WORD = re.compile(r"(?<!\S)[A-Za-z'`-]+[,;:.]*(?!\S)")  # parts of formulas do not count
@@ -38,6 +45,7 @@ def test_words_are_plain(name: str) -> None:
     docstrings = _docstrings(tree)
     comments = [(t.start[0], t.string) for t in tokenize.generate_tokens(io.StringIO(source).readline) if t.type == tokenize.COMMENT]
     strings = [(n.lineno, n.value) for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str) and " " in n.value]
+    strings = docstrings if name in RECORDED else strings
     found = [(line, f"opens with {at[0]}") for line, text in docstrings if (at := OPENINGS.match(text))]
     found += [(line, f"says {at[0]!r}") for line, text in [*comments, *strings] if (at := DIALECT.search(text))]
     long = [(line, part) for line, text in docstrings for part in _sentences(text) if len(WORD.findall(part)) > MOST]

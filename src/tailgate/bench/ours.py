@@ -9,6 +9,7 @@ import sys
 import tempfile
 import time
 import tracemalloc
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -59,7 +60,7 @@ class Playing(NamedTuple):
 
     seat: Seat
     attack: Attack
-    plan: Any
+    plan: object
 
 
 def playing(defence: Defence) -> Playing:
@@ -277,7 +278,7 @@ def _peak(episodes: int) -> int:
     """Return bytes that a vector environment takes at most, from its making to its third step."""
     tracemalloc.start()
     try:
-        env: Any = gymnasium.make_vec(CAR_FOLLOWING, num_envs=episodes)
+        env = gymnasium.make_vec(CAR_FOLLOWING, num_envs=episodes)
         env.reset(seed=0)
         for _ in range(3):
             env.step(env.action_space.sample())
@@ -288,7 +289,6 @@ def _peak(episodes: int) -> int:
 
 def memory() -> Go:
     """Measure the bytes that an episode of a vector environment takes at most: the difference between two batches."""
-
     _peak(1)  # what is imported on the way counts for neither
 
     def go(seconds: float) -> Sample:
@@ -300,10 +300,10 @@ def memory() -> Go:
 class _Timed:
     """A method that is timed."""
 
-    def __init__(self, method: Any) -> None:
+    def __init__(self, method: Callable[..., object]) -> None:
         self.method, self.seconds = method, 0.0
 
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, *arguments: object) -> object:
         started = time.process_time()
         try:
             return self.method(*arguments)

@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from importlib import import_module
 from itertools import cycle
 from pathlib import Path
@@ -32,7 +33,7 @@ def need(module: str, package: str, how: str) -> ModuleType:
         raise Missing(f"{package} is missing: {how}") from None
 
 
-def stepped(env: Any, actions: list[Any], steps: int = STEPS) -> Go:
+def stepped(env: gymnasium.Env[Any, Any], actions: Sequence[Any], steps: int = STEPS) -> Go:
     """Return steps per second of a single environment, resets included; it looks at the clock every `steps`."""
     env.reset(seed=0)
     coming = cycle(actions)
@@ -47,7 +48,7 @@ def stepped(env: Any, actions: list[Any], steps: int = STEPS) -> Go:
     return repeated(chunk)
 
 
-def batched(env: Any, rows: int = 16) -> Go:
+def batched(env: gymnasium.vector.VectorEnv[Any, Any, Any], rows: int = 16) -> Go:
     """Return steps per second of a vector environment, over all its rows, with actions drawn at random beforehand."""
     env.reset(seed=0)
     env.action_space.seed(0)
@@ -62,7 +63,7 @@ def batched(env: Any, rows: int = 16) -> Go:
     return repeated(chunk)
 
 
-def at_random(env: Any, count: int = 1024) -> list[Any]:
+def at_random(env: gymnasium.Env[Any, Any], count: int = 1024) -> list[Any]:
     """Return actions drawn at random beforehand."""
     env.action_space.seed(0)
     return [env.action_space.sample() for _ in range(count)]
@@ -104,7 +105,7 @@ def filterpy_kalman() -> Go:
     return repeated(chunk)
 
 
-# -- peers with processes of their own: they run in a child, so that no fork copies this process's threads
+# -- peers with processes: they run in a child, so that no fork copies this process's threads
 
 _CHILD = """
 import json, sys, time

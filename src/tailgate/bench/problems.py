@@ -1,13 +1,14 @@
 """The estimators' optimisation problems: ours in a batch, and cvxpy's parametrised solve of the same ones, one after the other.
 
-cvxpy compiles each problem once, and only the innovation differs between two solves, so that it does the least work that it can (Clarabel
-with its own tolerances, no warm start, whitened constants). Every second problem has the innovation of an attacked step.
+cvxpy compiles each problem once, and only the innovation differs between two solves: the least work possible. It solves by Clarabel with
+its default tolerances, without warm start, with whitened constants. Every second problem has the innovation of an attacked step.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from types import ModuleType
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from tailgate.core import Array, Innovation
 from tailgate.core.scenario import load_scenario
 from tailgate.estimators.distributed.distributed_kalman import fixed_point
 from tailgate.estimators.distributed.norm_resilient import axes, moved
-from tailgate.estimators.filters.kalman import KalmanState
+from tailgate.estimators.filters.kalman import KalmanPlan, KalmanState
 from tailgate.estimators.filters.robust import RobustKalmanFilter, believed, load_cvxpy
 
 from .lines import Go, Missing, Sample, repeated
@@ -68,16 +69,17 @@ def exactly(c: Case, form: Form) -> Callable[[], Array]:
     return lambda: num.apply(K, believed(r, wide, price))[:, 0]
 
 
-def _cvxpy() -> Any:
+def _cvxpy() -> ModuleType:
     try:
-        return load_cvxpy()
+        package: ModuleType = load_cvxpy()
+        return package
     except ImportError as error:
         raise Missing(str(error)) from None
 
 
 def by_cvxpy(c: Case, form: Form) -> Callable[[], Array]:
     """Return the same, one parametrised solve each: xh - xb (B, n)."""
-    cp: Any = _cvxpy()
+    cp = _cvxpy()
     white, root = np.linalg.inv(np.linalg.cholesky(c.R)), np.linalg.cholesky(c.Q).T
     d, a, r = cp.Variable(len(c.Q)), cp.Variable(len(c.C)), cp.Parameter(len(c.C))
     prior = cp.sum_squares(root @ d)
@@ -138,13 +140,14 @@ class Robust(NamedTuple):
     """Predicted states x (B, 1, 3), their innovations, and the constants of the filter `rkf` on stop-and-go-v0."""
 
     filter: RobustKalmanFilter
-    plan: Any
+    plan: KalmanPlan
     x: Array
     innovation: Innovation
 
 
 @cache
 def robust(batch: int) -> Robust:
+    """Return states of which every second one has the innovation of an attacked step."""
     model, filter = load_scenario("stop-and-go-v0").brief().model, RobustKalmanFilter()
     plan = filter.prepare(model)
     S = num.matmul(num.matmul(plan.C, plan.held), num.transpose(plan.C)) + plan.R
@@ -166,10 +169,10 @@ def robust_updates(batch: int) -> Go:
 
 def robust_by_cvxpy() -> Go:
     """Return the same update with a parametrised solve of its problem, one after the other."""
-    cp: Any = _cvxpy()
+    cp = _cvxpy()
     held = robust(ROWS)
     S, lam = held.innovation.S[0, 0], held.filter.price(held.innovation.S[:1])[0, 0]
-    K, root = held.plan.held[0] @ held.plan.C[0].T @ np.linalg.inv(S), np.linalg.cholesky(np.linalg.inv(S)).T
+    K, root = np.asarray(held.plan.held)[0] @ held.plan.C[0].T @ np.linalg.inv(S), np.linalg.cholesky(np.linalg.inv(S)).T
     z, known = cp.Variable(2), cp.Parameter(2)
     solve = _solves(cp.Problem(cp.Minimize(cp.sum_squares(known - root @ z) + lam @ cp.abs(z))), known, z, held.innovation.r[:, 0] @ root.T)
 

@@ -149,6 +149,7 @@ def page(record: Record, plots: list[str]) -> str:
 
 
 def plot_name(plot: Record) -> str:
+    """Return the file name of a plot."""
     return f"speed-{plot['name'].removeprefix('scaling-')}.png"
 
 

@@ -71,18 +71,19 @@ def library() -> ctypes.CDLL:
     return held
 
 
-def constants(place: Scenario) -> Array:
+def constants(scenario: Scenario) -> Array:
     """Return the numbers of a scenario in the order of `enum constant`."""
-    plant, acc, road = place.plant, place.controller, place.manoeuvre
-    model, reward = place.brief().model, Reward()
+    plant, acc, road = scenario.plant, scenario.controller, scenario.manoeuvre
+    model, reward = scenario.brief().model, Reward()
     A, B = model.A, model.B
     out = [
         plant.dt, A[0, 2], A[1, 2], A[2, 2], B[0, 0], B[1, 0], B[2, 0], *np.sqrt(np.array(plant.process_var)), *model.Q.diagonal(),
-        *model.R[0].diagonal(), *np.sqrt(np.array(place.sensor.noise_var)), *plant.prior_var, ETA, plant.position, plant.speed, plant.accel,
-        plant.gap, plant.lead_speed, acc.headway, acc.standstill, acc.gamma, acc.set_speed, acc.accel_min, acc.accel_max, *road.cruise,
+        *model.R[0].diagonal(), *np.sqrt(np.array(scenario.sensor.noise_var)), *plant.prior_var, ETA,
+        plant.position, plant.speed, plant.accel, plant.gap, plant.lead_speed,
+        acc.headway, acc.standstill, acc.gamma, acc.set_speed, acc.accel_min, acc.accel_max, *road.cruise,
         *road.dwell, road.decel, road.accel_rate, road.low_speed, road.cruise_speed, idm.IDM_SPEED, idm.IDM_HEADWAY, idm.IDM_GAP,
         idm.IDM_ACCEL, 2.0 * math.sqrt(idm.IDM_ACCEL * idm.IDM_DECEL), idm.IDM_BRAKE, reward.gap_shaping, reward.error_shaping,
-        reward.gamma, NEAR, place.horizon, *(role << 16 for role in (Role.PROCESS, Role.SENSOR, Role.MANOEUVRE)),
+        reward.gamma, NEAR, scenario.horizon, *(role << 16 for role in (Role.PROCESS, Role.SENSOR, Role.MANOEUVRE)),
     ]  # fmt: skip
     return np.array(out, np.float64)
 
@@ -90,16 +91,17 @@ def constants(place: Scenario) -> Array:
 class Yardstick:
     """n episodes (a multiple of 64) of `whole` or `bare`; `bias` (2, horizon + 1) is added to the readings by step."""
 
-    def __init__(self, form: Form, seeds: range, place: Scenario | None = None, bias: Array | None = None) -> None:
-        place = load_scenario(SCENARIO) if place is None else place
-        if len(seeds) % LANES or round(place.plant.rear_reaction / place.plant.dt) != REACTION:
-            raise InputError("yardstick", place.name, f"a multiple of {LANES} episodes behind whom a driver reacts {REACTION} steps late")
-        self.form, self.blocks, self.constants, self._held = form, len(seeds) // LANES, constants(place), library()
+    def __init__(self, form: Form, seeds: range, scenario: Scenario | None = None, bias: Array | None = None) -> None:
+        scenario = load_scenario(SCENARIO) if scenario is None else scenario
+        if len(seeds) % LANES or round(scenario.plant.rear_reaction / scenario.plant.dt) != REACTION:
+            wanted = f"a multiple of {LANES} episodes, and a driver behind who reacts {REACTION} steps late"
+            raise InputError("yardstick", scenario.name, wanted)
+        self.form, self.blocks, self.constants, self._held = form, len(seeds) // LANES, constants(scenario), library()
         assert len(self.constants) == self._held.constants()
         self.state = np.zeros((self.blocks, self._held.rows(), LANES))
         self.words = np.zeros((self.blocks, WORDS, LANES), np.uint64)
         self.words[:, 0] = keys("tune", seeds).key[:, 0].reshape(self.blocks, LANES)
-        self.table = np.ascontiguousarray(np.zeros((2, place.horizon + 1)) if bias is None else bias, np.float64)
+        self.table = np.ascontiguousarray(np.zeros((2, scenario.horizon + 1)) if bias is None else bias, np.float64)
         self.done = 0
         getattr(self._held, f"{form}_start")(self.blocks, *self._addresses()[:3])
 
@@ -117,17 +119,17 @@ class Yardstick:
         return self.state[:, ROW[name]].reshape(-1)
 
 
-def injection(place: Scenario, value: float, first: int, last: int) -> Array:
+def injection(scenario: Scenario, value: float, first: int, last: int) -> Array:
     """Return (2, horizon + 1) the bias of both readings by step."""
-    bias = np.zeros((2, place.horizon + 1))
+    bias = np.zeros((2, scenario.horizon + 1))
     bias[:, first : last + 1] = value
     return bias
 
 
 def line(form: Form, episodes: int) -> Go:
     """Measure steps per second of the yardstick, under the injection that the loop is measured with."""
-    place = load_scenario(SCENARIO)
-    held = Yardstick(form, range(episodes), place, injection(place, -4.0, 50, 500))
+    scenario = load_scenario(SCENARIO)
+    held = Yardstick(form, range(episodes), scenario, injection(scenario, -4.0, 50, 500))
 
     def chunk() -> int:
         held.run(20)

@@ -49,11 +49,24 @@ def admit(
     episodes: int | None = None, workers: int = 1, rows_file: Path | None = None, beacon: str = "",
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Admitted | None, list[dict[str, Any]]]:  # fmt: skip
-    """Play an attack and all that are listed and know as much, on select seeds; append what came of it. -> line (None: refused), tests.
+    """Play an attack and all that are listed and know as much, on select seeds; append it to the list if it wins.
 
-    It wins where it does more damage in some scenario than the worst of the others in any, against at least one defence, by the exact
-    paired test, adjusted after Holm for all defences and scenarios, at `next_level` of alpha. dose: the middle one of those that the suite
-    shows unless given. beacon: of whose round the seeds are.
+    It wins if it does more damage in some scenario than the worst of the others in any, against at least one defence. The exact paired
+    test decides, adjusted after Holm for all defences and scenarios, at `next_level` of alpha.
+
+    Parameters
+    ----------
+    dose : int, optional
+        The dose of all episodes; by default the middle one of those that the suite shows.
+    beacon : str
+        The beacon of the round that the seeds are from.
+
+    Returns
+    -------
+    Admitted or None
+        The new line of the list; None if the attack is refused.
+    list of dict
+        The tests, one for each defence and scenario.
     """
     asked, listed = next_level(list_of(suite, path), alpha), list(attacks_of(suite, path))
     spec = Spec("attack", attack)
@@ -79,7 +92,7 @@ def admit(
     for defence in defences:
         worst = Worst(table, defence, level, alpha)
         played = [k for k, pair in enumerate(worst.pairs) if pair not in worst.lost]
-        mine = [k for k in played if table.columns[worst.pairs[k][1]].attack == attack]
+        mine = [k for k in played if table.attackers[worst.pairs[k][1]].attack == attack]
         others = [k for k in played if k not in mine]
         best = max(others, key=lambda k: float(worst.shares[k, 0]), default=None)
         for k in mine:

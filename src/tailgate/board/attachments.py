@@ -1,8 +1,11 @@
-"""Attachments of a board: files in its folder with what rows do not tell. One class is one format.
+"""Attachments of a board: files in its folder with facts that rows do not hold. One class is one format.
 
-A board is a pure function of rows, so clocks, machines, fresh episodes and past mistakes are kept apart from it: step_time.json (what a
-step of each defence costs), timing.json (what the timing of trained attackers is worth), errata.json (figures that were superseded)
-and run.json (what it took to play the board).
+A board is a pure function of rows, so clocks, machines, fresh episodes and past mistakes are kept apart from it:
+
+    step_time.json  time of a step of each defence
+    timing.json     worth of the timing of trained attackers
+    errata.json     superseded figures
+    run.json        effort of playing the board
 """
 
 from __future__ import annotations
@@ -60,7 +63,7 @@ class Attachment(BaseModel):
     def belongs(self, board: Board) -> Self | None:
         """Return what is of this board. Raises InputError for an attachment of another suite."""
         if self.suite != board.suite.name:
-            raise InputError(f"{self.WHAT}: suite", self.suite, f"{board.suite.name}, whose board they lie beside")
+            raise InputError(f"{self.WHAT}: suite", self.suite, f"{board.suite.name}, the suite of the board in the same folder")
         return self
 
 
@@ -163,7 +166,7 @@ class Timing(Attachment):
         mine = board.suite
         for name, wanted in (("suite", mine.name), ("hash", mine.hash), ("beacon", mine.beacon or "")):
             if (held := getattr(self, name)) != wanted:
-                raise InputError(f"{self.WHAT}: {name}", held, f"{wanted!r}, as of the board that they lie beside")
+                raise InputError(f"{self.WHAT}: {name}", held, f"{wanted!r}, as in the board in the same folder")
         damage = {(c.defence, c.attack, c.scenario, c.dose): c.damage.value for c in board.cells if c.damage}
         kept = [e for e in self.entries if damage.get((e.defence, e.attack, e.scenario, e.dose)) == e.board]
         return self.model_copy(update={"entries": kept})

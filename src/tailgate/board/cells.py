@@ -18,7 +18,7 @@ from tailgate.evaluation.rounds import numbered
 from tailgate.evaluation.rows import CLEAN, Row
 from tailgate.evaluation.stats import proportion
 
-from .damage import FAILED, MISSING, PLAYED, SKIPPED, Column, Key, Table, columns_of, damaged, doses_of, in_order
+from .damage import FAILED, MISSING, PLAYED, SKIPPED, Attacker, Key, Table, attackers_of, damaged, doses_of, in_order
 from .schema import CellLine, Data
 
 PRINTS = ("hits", "decisions", "trace")  # which older boards lack
@@ -79,10 +79,10 @@ def vague(cell: Data) -> bool:
 
 def ordered(cells: Sequence[Data], table: Table) -> list[Data]:
     """Return cells in the order of the suite, clean runs first."""
-    places, slots = list(table.scenarios), {dose: slot for slot, dose in enumerate(table.doses)}
-    attacks = {column.attack: at for at, column in reversed(list(enumerate(table.columns)))}
+    scenarios, at_dose = list(table.scenarios), {dose: i for i, dose in enumerate(table.doses)}
+    attacks = {attacker.attack: at for at, attacker in reversed(list(enumerate(table.attackers)))}
     return sorted(cells, key=lambda cell: (
-        places.index(cell["scenario"]), slots[cell["dose"]], table.defences.index(cell["defence"]),
+        scenarios.index(cell["scenario"]), at_dose[cell["dose"]], table.defences.index(cell["defence"]),
         attacks.get(cell["attack"], -1), cell["knowledge"],
     ))  # fmt: skip
 
@@ -91,15 +91,15 @@ def cells_of(table: Table) -> list[Data]:
     """Return every cell that has rows, in the order of the suite, clean runs first."""
     return ordered([
         {
-            "scenario": key.scenario, "dose": table.doses[key.slot], "defence": key.defence, "attack": key.column.attack,
-            "knowledge": key.column.knowledge, "learned": bool(rows[0].get("learned")), "optimal": bool(rows[0].get("optimal")),
+            "scenario": key.scenario, "dose": table.doses[key.dose], "defence": key.defence, "attack": key.attacker.attack,
+            "knowledge": key.attacker.knowledge, "learned": bool(rows[0].get("learned")), "optimal": bool(rows[0].get("optimal")),
         } | figures(rows, table.suite)
         for key, rows in table.cells.items()
     ], table)  # fmt: skip
 
 
-def place_of(cell: Data) -> tuple[Any, ...]:
-    """Return the key that tells a cell from the others of its board."""
+def cell_key(cell: Data) -> tuple[Any, ...]:
+    """Return the key of a cell, which no other cell of its board has."""
     return cell["scenario"], cell["dose"], cell["defence"], cell["attack"], cell["knowledge"]
 
 
@@ -109,13 +109,13 @@ def shared_of(board: Data) -> tuple[str, ...]:
     Files of policies are left out, as each was trained against one of the entries. So are attacks that do not count.
     """
     idle = {attack["attack"] for attack in board["attacks"] if attack.get("withdrawn") or attack.get("optimal")}
-    places = {(cell["defence"], cell["scenario"], cell["dose"]) for cell in board["cells"]}
+    everywhere = {(cell["defence"], cell["scenario"], cell["dose"]) for cell in board["cells"]}
     met: dict[str, set[tuple[Any, ...]]] = {}
     for cell in board["cells"]:
         if cell["attack"] != CLEAN and not cell["attack"].endswith(".json"):
             met.setdefault(cell["attack"], set()).add((cell["defence"], cell["scenario"], cell["dose"]))
     marked = {attack["attack"] for attack in board["attacks"] if attack.get("shared")}
-    return tuple(sorted((marked | {attack for attack, held in met.items() if held == places}) - idle))
+    return tuple(sorted((marked | {attack for attack, held in met.items() if held == everywhere}) - idle))
 
 
 def table_of(board: Data, suite: Suite) -> Table:
@@ -123,44 +123,44 @@ def table_of(board: Data, suite: Suite) -> Table:
 
     Raises InputError for a cell that is there twice, and for one of another suite.
     """
-    places = {place.name: place for place in (load_scenario(name) for name in suite.scenarios)}
+    scenarios = {scenario.name: scenario for scenario in (load_scenario(name) for name in suite.scenarios)}
     doses, listed = doses_of(suite), (*suite.attacks, *(a["attack"] for a in board["attacks"] if a.get("admitted")))
-    slots = {dose: slot for slot, dose in enumerate(doses)}
+    at_dose = {dose: i for i, dose in enumerate(doses)}
     cells: dict[Key, Data] = {}
     for i, cell in enumerate(board["cells"]):
-        key = Key(cell["scenario"], slots.get(cell["dose"], -1), cell["defence"], Column(cell["attack"], cell["knowledge"]))
-        if key.slot < 0 or key.scenario not in places:
+        key = Key(cell["scenario"], at_dose.get(cell["dose"], -1), cell["defence"], Attacker(cell["attack"], cell["knowledge"]))
+        if key.dose < 0 or key.scenario not in scenarios:
             raise InputError(f"board.cells[{i}]", [cell["scenario"], cell["dose"]], f"a scenario and a dose of the suite {suite.name}")
         if key in cells:
-            raise InputError(f"board.cells[{i}]", [*key[:3], *key.column], "a cell that is there once")
+            raise InputError(f"board.cells[{i}]", [*key[:3], *key.attacker], "a cell that is there once")
         cells[key] = cell
     counts = [(key.scenario, cell["n"] + cell["failed"]) for key, cell in cells.items()]
-    episodes = {name: max((n for scenario, n in counts if scenario == name), default=0) for name in places}
-    columns = columns_of((key.column for key in cells), listed)
+    episodes = {name: max((n for scenario, n in counts if scenario == name), default=0) for name in scenarios}
+    attackers = attackers_of((key.attacker for key in cells), listed)
     defences = in_order({key.defence for key in cells}, suite.defences)
-    shape = len(defences), len(columns), len(doses)
-    harm = {name: np.full((*shape, episodes[name]), np.nan) for name in places}
-    state = {name: np.full(shape, MISSING) for name in places}
+    shape = len(defences), len(attackers), len(doses)
+    harm = {name: np.full((*shape, episodes[name]), np.nan) for name in scenarios}
+    state = {name: np.full(shape, MISSING) for name in scenarios}
     clean: dict[tuple[str, str], list[Row]] = {}
-    for key in sorted(cells, key=lambda key: key.slot):
+    for key in sorted(cells, key=lambda key: key.dose):
         cell = cells[key]
         whole = cell["n"] == episodes[key.scenario]
-        if key.column.attack == CLEAN:
+        if key.attacker.attack == CLEAN:
             if whole:
                 rows = [{"distance_travelled": 0.0, "crashed": bool(hit)} for hit in hits_of(cell)]
                 clean.setdefault((key.scenario, key.defence), rows)
             continue
-        at = defences.index(key.defence), columns.index(key.column), key.slot
+        at = defences.index(key.defence), attackers.index(key.attacker), key.dose
         state[key.scenario][at] = FAILED if cell["failed"] else PLAYED if whole else SKIPPED
         if whole:
             harm[key.scenario][at] = hits_of(cell)
-    marked = {mark: {key.column.attack for key, cell in cells.items() if cell.get(mark)} for mark in ("optimal", "learned")}
-    marks = {mark: {column: column.attack in names for column in columns} for mark, names in marked.items()}
+    marked = {mark: {key.attacker.attack for key, cell in cells.items() if cell.get(mark)} for mark in ("optimal", "learned")}
+    marks = {mark: {attacker: attacker.attack in names for attacker in attackers} for mark, names in marked.items()}
     withdrawn = frozenset(a["attack"] for a in board["attacks"] if a.get("withdrawn"))
     purpose, beacon = board["suite"].get("purpose") or "report", board["suite"].get("beacon") or ""
     seeds = {name: tuple(sorted(numbered(beacon, suite.name, purpose, 0, n))) for name, n in episodes.items()}
     return Table(
-        suite, places, doses, defences, columns, seeds, {}, clean, harm, state, marks["optimal"], marks["learned"],
+        suite, scenarios, doses, defences, attackers, seeds, {}, clean, harm, state, marks["optimal"], marks["learned"],
         tuple(dict.fromkeys(listed)), withdrawn, purpose, beacon, sum(episodes[key.scenario] for key in cells),
         frozenset(key for key, cell in cells.items() if vague(cell)), frozenset(shared_of(board)),
     )  # fmt: skip
@@ -171,31 +171,31 @@ def joined(table: Table, held: Table, kept: Collection[str], added: Mapping[str,
 
     A kept defence has rows for clean runs, and for attacks that it had not met (`added`).
     """
-    fresh = {key: rows for key, rows in table.cells.items() if key.defence not in kept or key.column.attack in added.get(key.defence, ())}
+    fresh = {key: rows for key, rows in table.cells.items() if key.defence not in kept or key.attacker.attack in added.get(key.defence, ())}
     parts = [(table, [name for name in table.defences if name not in kept]), (held, [name for name in held.defences if name in kept])]
     defences = in_order({name for _, names in parts for name in names}, table.suite.defences)
     met = {
-        column for part, names in parts for i, column in enumerate(part.columns) for state in part.state.values()
+        attacker for part, names in parts for i, attacker in enumerate(part.attackers) for state in part.state.values()
         if (state[[part.defences.index(name) for name in names], i] != MISSING).any()
-    } | {key.column for key in fresh}  # fmt: skip
-    columns = columns_of(met, table.listed)
-    shape = len(defences), len(columns), len(table.doses)
+    } | {key.attacker for key in fresh}  # fmt: skip
+    attackers = attackers_of(met, table.listed)
+    shape = len(defences), len(attackers), len(table.doses)
     harm = {name: np.full((*shape, len(seeds)), np.nan) for name, seeds in held.seeds.items()}
     state = {name: np.full(shape, MISSING) for name in held.seeds}
     for part, names in parts:
-        shared = [column for column in part.columns if column in columns]
-        mine = np.ix_([part.defences.index(name) for name in names], [part.columns.index(column) for column in shared])
-        here = np.ix_([defences.index(name) for name in names], [columns.index(column) for column in shared])
+        shared = [attacker for attacker in part.attackers if attacker in attackers]
+        mine = np.ix_([part.defences.index(name) for name in names], [part.attackers.index(attacker) for attacker in shared])
+        here = np.ix_([defences.index(name) for name in names], [attackers.index(attacker) for attacker in shared])
         for name in held.seeds:
             harm[name][here], state[name][here] = part.harm[name][mine], part.state[name][mine]
-    for key in (key for key in fresh if key.defence in kept and key.column in columns):
-        at = defences.index(key.defence), columns.index(key.column), key.slot
-        cell = table.defences.index(key.defence), table.columns.index(key.column), key.slot
+    for key in (key for key in fresh if key.defence in kept and key.attacker in attackers):
+        at = defences.index(key.defence), attackers.index(key.attacker), key.dose
+        cell = table.defences.index(key.defence), table.attackers.index(key.attacker), key.dose
         harm[key.scenario][at], state[key.scenario][at] = table.harm[key.scenario][cell], table.state[key.scenario][cell]
-    optimal = {column: any(part.optimal.get(column, False) for part, _ in parts) for column in columns}
-    learned = {column: any(part.learned.get(column, False) for part, _ in parts) for column in columns}
+    optimal = {attacker: any(part.optimal.get(attacker, False) for part, _ in parts) for attacker in attackers}
+    learned = {attacker: any(part.learned.get(attacker, False) for part, _ in parts) for attacker in attackers}
     clean = {at: rows for at, rows in held.clean.items() if at[1] in kept} | table.clean
     return dataclasses.replace(
-        table, defences=defences, columns=columns, cells=fresh, clean=clean, harm=harm, state=state, optimal=optimal,
+        table, defences=defences, attackers=attackers, cells=fresh, clean=clean, harm=harm, state=state, optimal=optimal,
         learned=learned, vague=frozenset(key for key in held.vague if key.defence in kept), shared=held.shared,
     )  # fmt: skip

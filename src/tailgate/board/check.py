@@ -1,8 +1,8 @@
 """Check of a board from the board alone, without its rows: its cells are played again and compared.
 
-A cell names a scenario, a dose, a defence and an attack of a suite that is here; its seeds are those of the suite's round. As with rows,
-nothing is imported that the board names. Figures of entries are made again: those that follow from cells always, and all others where all
-cells of the board were played.
+A cell names a scenario, a dose, a defence and an attack of an installed suite. Its seeds are those of the suite's round. As with rows,
+nothing is imported that the board names. Figures of entries that follow from cells are always made again. All others are made again if
+all cells of the board were played.
 """
 
 from __future__ import annotations
@@ -38,16 +38,34 @@ def check(
     data: Data, *, sample: int | None = None, sample_seed: int = 0, defences: Sequence[str] = (), workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Data:  # fmt: skip
-    """Play the cells of a board again, and compare how many episodes were played, failed and came to damage, which these
-    were, and the fingerprints of all.
+    """Play the cells of a board again, and compare numbers of episodes, damage and fingerprints.
 
-    data: a board, as JSON; sample: number of cells, drawn by sample_seed (default: all); defences: only the cells of these.
-    The report has `counts`, `entries` (the same for each defence), `reasons` and `findings`, cells that differ or could not be checked;
-    `untrained`: attackers whose files are not here, though `leaderboard attack` would train them again, to the same weights;
-    `strays`: figures that do not follow from the cells, by `defence` and `field`; `untold`: ranked entries of whose comparisons cells tell
-    the limits only, as these do not say which episodes came to damage; `scored`: whether ranks, gates and all else could be made
-    again, as all cells were played; `prints` has hits and fingerprints of each cell that came out equal, by its place in the board.
-    Raises InputError for a board of another suite or version than is here, and for a defence that is not on it.
+    Parameters
+    ----------
+    data : dict
+        The board, as JSON.
+    sample : int, optional
+        Number of cells, drawn by `sample_seed`; by default all.
+    defences : sequence of str
+        Only the cells of these.
+
+    Returns
+    -------
+    dict
+        A report:
+
+        - `counts` of cells, and `entries`: the same for each defence;
+        - `findings`: cells that differ or could not be checked, with `reasons`;
+        - `untrained`: attackers without files, which `leaderboard attack` would train again to the same weights;
+        - `strays`: figures that do not follow from the cells, by `defence` and `field`;
+        - `untold`: ranked entries whose cells do not say which episodes came to damage, so that their comparisons are limits only;
+        - `scored`: true if all cells were played, so that ranks, gates and all other figures were made again;
+        - `prints`: hits and fingerprints of each equal cell, by its index in the board.
+
+    Raises
+    ------
+    InputError
+        For a board of another suite or version, and for a defence that is not on it.
     """
     board = read_board(data)
     suite = suite_of(board)

@@ -9,13 +9,15 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Generic
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.provenance import commit, processor
 from tailgate.base.version import VERSION
-from tailgate.core import draws, no_command
+from tailgate.core import Array, Defence, Estimate, Received, draws, no_command
+from tailgate.core.components import P, S
+from tailgate.core.draws import Draws
 from tailgate.core.loop import Loop
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_scenario
@@ -26,10 +28,10 @@ ROUNDS, MOST = 5, 200  # episodes of each defence that count; steps of an episod
 Progress = Callable[[int, int], None]
 
 
-class _Timed:
-    """A defence that keeps how long each of its steps took [ns]."""
+class Timed(Generic[P, S]):
+    """A defence that records the time of each of its steps [ns]."""
 
-    def __init__(self, defence: Any) -> None:
+    def __init__(self, defence: Defence[P, S]) -> None:
         self.defence = defence
         self.taken: list[int] = []
 
@@ -38,14 +40,14 @@ class _Timed:
             raise AttributeError(name)
         return getattr(self.defence, name)
 
-    def step(self, *arguments: Any) -> Any:
+    def step(self, plan: P, state: S, received: Received, known_u: Array, draws: Draws) -> tuple[S, Estimate]:
         began = time.perf_counter_ns()
-        answer = self.defence.step(*arguments)
+        answer = self.defence.step(plan, state, received, known_u, draws)
         self.taken.append(time.perf_counter_ns() - began)
         return answer
 
 
-def _round(loop: Loop, timed: _Timed, seed: int) -> float:
+def _round(loop: Loop, timed: Timed, seed: int) -> float:
     """Return the median time of the first steps of a clean episode [us]."""
     timed.taken.clear()
     state, nothing = loop.start(draws.keys("calibrate", [seed])), no_command(1, loop.model.agents, len(loop.model.wires))
@@ -59,18 +61,18 @@ def _round(loop: Loop, timed: _Timed, seed: int) -> float:
 def measure(suite: Suite, defences: Sequence[str] = (), *, rounds: int = ROUNDS, progress: Progress | None = None) -> Clock:
     """Measure step times of a suite's registered defences in its first scenario. Those that mean nothing there are left out.
 
-    The first round of each loads what the defence needs. Raises InputError for a defence that does not exist, that fails, or is a class of
-    somebody's own, for a named one that means nothing there, and where none is left.
+    The first round of each loads what the defence needs. Raises InputError for a defence that does not exist, that fails, or that is an
+    unregistered class. The same goes for a named one that means nothing there, and if none is left.
     """
     sizes.check("rounds", rounds)
-    place = load_scenario(suite.scenarios[0])
-    seats: dict[str, tuple[Loop, _Timed]] = {}
+    scenario = load_scenario(suite.scenarios[0])
+    seats: dict[str, tuple[Loop, Timed]] = {}
     for text in dict.fromkeys(defences or suite.defences):
         spec = Spec("defence", text)
         spec.refuse_imports("step times")
-        timed = _Timed(spec.make())
+        timed = Timed(spec.make())
         try:
-            loop = place.loop(timed, spec.entry.uses)
+            loop = scenario.loop(timed, spec.entry.uses)
             _round(loop, timed, 0)
         except NotApplicable:
             if defences:
@@ -78,7 +80,7 @@ def measure(suite: Suite, defences: Sequence[str] = (), *, rounds: int = ROUNDS,
             continue
         seats[text] = loop, timed
     if not seats:
-        raise InputError("defences", list(suite.defences), f"one that means something in {place.name}")
+        raise InputError("defences", list(suite.defences), f"one that means something in {scenario.name}")
     taken: dict[str, list[float]] = {text: [] for text in seats}
     for seed in range(1, rounds + 1):
         for i, (text, (loop, timed)) in enumerate(seats.items()):
@@ -91,6 +93,6 @@ def measure(suite: Suite, defences: Sequence[str] = (), *, rounds: int = ROUNDS,
     ]
     model = next(iter(seats.values()))[0].model
     return Clock(
-        suite=suite.name, scenario=place.name, agents=model.agents, rounds=rounds, processor=processor(),
+        suite=suite.name, scenario=scenario.name, agents=model.agents, rounds=rounds, processor=processor(),
         version=VERSION, commit=commit(), entries=entries,
     )  # fmt: skip

@@ -26,28 +26,28 @@ def strays(board: Data, suite: Suite) -> list[Data]:
     raises InputError for a cell that is there twice.
     """
     table, out = table_of(board, suite), []
-    held, slots = board["suite"], shown(suite)
-    told = {"doses": list(table.doses), "shown": [str(table.doses[slot]) for slot in slots] if suite.shown else [], "bound": suite.bound}
+    held, doses = board["suite"], shown(suite)
+    told = {"doses": list(table.doses), "shown": [str(table.doses[dose]) for dose in doses] if suite.shown else [], "bound": suite.bound}
     said = {"doses": held["doses"], "shown": list(held.get("shown", {})), "bound": held.get("bound")}
     out += [_stray("", f"suite.{key}", said[key], told[key]) for key in told if not same(said[key], told[key])]
     for i, cell in enumerate(board["cells"]):
         here = share(int(hits_of(cell).sum()), cell["n"])._asdict() if cell["n"] else None
         if not same(cell["damage"], here):
             out.append(_stray(cell["defence"], f"cells[{i}].damage", cell["damage"], here))
-    slot, alpha = middle(suite), held.get("alpha", 0.05)
+    dose, alpha = middle(suite), held.get("alpha", 0.05)
     levels: Levels = {name: {k: Worst(table, name, k, alpha) for k in KNOWLEDGE} for name in table.defences}
     for entry in board["entries"]:
         name = entry["defence"]
         if name not in table.defences:
             out.append(_stray(name, "cells", 0, "cells of every attack, scenario and dose"))
             continue
-        here = of_worst(table, levels[name], slot) | {"curves": curves(levels[name])}
+        here = of_worst(table, levels[name], dose) | {"curves": curves(levels[name])}
         mine = entry | {"curves": [curve for curve in board["curves"] if curve["defence"] == name]}
         out += [_stray(name, key, mine.get(key), here[key]) for key in here if not same(mine.get(key), here[key])]
         if entry["status"] != "unranked" and (lost := levels[name]["black"].lost):
-            where, column = lost[0][0], table.columns[lost[0][1]]
-            out.append(_stray(name, "status", entry["status"], f"unranked: not all cells of {column.attack} on {where} are there"))
-    return out + _ranks(board, levels, slot, alpha)
+            where, attacker = lost[0][0], table.attackers[lost[0][1]]
+            out.append(_stray(name, "status", entry["status"], f"unranked: not all cells of {attacker.attack} on {where} are there"))
+    return out + _ranks(board, levels, dose, alpha)
 
 
 def untold(board: Data, suite: Suite) -> list[str]:
@@ -59,7 +59,7 @@ def untold(board: Data, suite: Suite) -> list[str]:
     return [entry["defence"] for entry in board["entries"] if entry["status"] == "ranked" and entry["defence"] in unknown]
 
 
-def _ranks(board: Data, levels: Levels, slot: int, alpha: float) -> list[Data]:
+def _ranks(board: Data, levels: Levels, dose: int, alpha: float) -> list[Data]:
     """Return strays among the classes of entries, the comparisons of their pairs, and the ranks that follow."""
     out: list[Data] = []
     groups: dict[str, dict[str, Data]] = {}
@@ -79,7 +79,7 @@ def _ranks(board: Data, levels: Levels, slot: int, alpha: float) -> list[Data]:
         if any(name not in levels or not levels[name]["black"].complete for name in mine):
             continue
         said = duels_of[group]
-        made, ranks = compare({name: levels[name]["black"].all_harm(slot) for name in mine}, group, alpha, said)
+        made, ranks = compare({name: levels[name]["black"].all_harm(dose) for name in mine}, group, alpha, said)
         if not same(said, made):
             pairs = {(duel["a"], duel["b"]): duel for duel in said}
             off = [f"{one['a']} and {one['b']}" for one in made if not same(pairs.get((one["a"], one["b"])), one)]
@@ -94,13 +94,13 @@ def sharpened(board: Data, suite: Suite) -> Data:
     before = board.get("comparisons", [])
     if not any(duel.get("bound") for duel in before):
         return board
-    table, slot, alpha = table_of(board, suite), middle(suite), board["suite"].get("alpha", 0.05)
+    table, dose, alpha = table_of(board, suite), middle(suite), board["suite"].get("alpha", 0.05)
     duels: list[Data] = []
     ranks: dict[str, Data] = {}
     for group in dict.fromkeys(duel.get("class", "") for duel in before):
         told = [duel for duel in before if duel.get("class", "") == group]
         names = list(dict.fromkeys(name for duel in told for name in (duel["a"], duel["b"])))
-        harm = {name: Worst(table, name, KNOWLEDGE[0], alpha).all_harm(slot) for name in names}
+        harm = {name: Worst(table, name, KNOWLEDGE[0], alpha).all_harm(dose) for name in names}
         again = {(duel["a"], duel["b"]): duel for duel in compare(harm, group, alpha, told)[0]}
         made = [again[d["a"], d["b"]] if d.get("bound") else d for d in told]
         new, places = settled(made, names, alpha)

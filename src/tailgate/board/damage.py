@@ -18,7 +18,7 @@ from tailgate.play.metrics import METRICS
 PLAYED, MISSING, SKIPPED, FAILED = range(4)  # what became of a cell
 
 
-class Column(NamedTuple):
+class Attacker(NamedTuple):
     """An attack with the knowledge that it was granted."""
 
     attack: str
@@ -26,12 +26,12 @@ class Column(NamedTuple):
 
 
 class Key(NamedTuple):
-    """A cell: `slot` is the place of its dose among the suite's doses."""
+    """A cell: `dose` is an index of the suite's doses."""
 
     scenario: str
-    slot: int
+    dose: int
     defence: str
-    column: Column
+    attacker: Attacker
 
 
 def order(knowledge: str) -> int:
@@ -57,22 +57,22 @@ def damaged(row: Row, suite: Suite) -> bool:
 class Table:
     """Rows by cell, everything in a fixed order: that of the suite, then by name. The order of the rows changes nothing.
 
-    harm[scenario] (defences, columns, slots, episodes) is 1 for damage and 0 for none, NaN where nothing was played; state[scenario]
-    (defences, columns, slots) says why. Columns are attacks; clean rows stand apart in `clean`, by scenario and defence.
+    harm[scenario] (defences, attackers, doses, episodes) is 1 for damage and 0 for none, NaN where nothing was played; state[scenario]
+    (defences, attackers, doses) says why. Clean rows are apart in `clean`, by scenario and defence.
     """
 
     suite: Suite
     scenarios: dict[str, Scenario]
     doses: tuple[int | None, ...]  # ascending, none last
     defences: tuple[str, ...]
-    columns: tuple[Column, ...]
+    attackers: tuple[Attacker, ...]
     seeds: dict[str, tuple[int, ...]]  # of each scenario
     cells: dict[Key, list[Row]]  # rows by seed
     clean: dict[tuple[str, str], list[Row]]
     harm: dict[str, Array]
     state: dict[str, Array]
-    optimal: dict[Column, bool]
-    learned: dict[Column, bool]
+    optimal: dict[Attacker, bool]
+    learned: dict[Attacker, bool]
     listed: tuple[str, ...]  # the suite's attacks, and those that were admitted
     withdrawn: frozenset[str]  # attacks that an erratum took back
     purpose: str
@@ -87,10 +87,10 @@ class Table:
         return self.shared.union(self.listed)
 
     def known(self, knowledge: str) -> list[int]:
-        """Return columns of attacks that know no more than this. Computed optima are ceilings, and count nowhere."""
+        """Return indices of attackers that know no more than this. Computed optima are ceilings, and count nowhere."""
         return [
-            i for i, column in enumerate(self.columns)
-            if order(column.knowledge) <= order(knowledge) and not self.optimal[column] and column.attack not in self.withdrawn
+            i for i, attacker in enumerate(self.attackers)
+            if order(attacker.knowledge) <= order(knowledge) and not self.optimal[attacker] and attacker.attack not in self.withdrawn
         ]  # fmt: skip
 
     def nominal(self) -> list[str]:
@@ -98,12 +98,13 @@ class Table:
         return list(self.suite.nominal)
 
     def applies(self, scenario: str) -> Array:
-        """Return (columns,) bool: counts in this scenario. An attack without a meaning against any defence does not, nor one nobody
-        owes.
+        """Return (attackers,) bool: the attacks that count in this scenario.
+
+        An attack does not count without a meaning against any defence, or if no defence owes it.
         """
         state = self.state[scenario]
         played = ~np.isin(state, (SKIPPED, MISSING)).all(axis=(0, 2))
-        owed = np.array([column.attack in self.asked for column in self.columns], bool)
+        owed = np.array([attacker.attack in self.asked for attacker in self.attackers], bool)
         return np.asarray(played | (owed & (state == MISSING).any(axis=(0, 2))))
 
 
@@ -117,26 +118,26 @@ def tabulate(rows: Iterable[Row], suite: Suite, added: Sequence[str] = (), withd
         raise InputError("rows", rows, "at least one row of an evaluation")
     if not suite.scenarios or not suite.doses:
         raise InputError(f"suite {suite.name}", list(suite.scenarios), "at least one scenario and one dose")
-    places = {place.name: place for place in (load_scenario(name) for name in suite.scenarios)}
+    scenarios = {scenario.name: scenario for scenario in (load_scenario(name) for name in suite.scenarios)}
     doses = doses_of(suite)
-    slots = {
-        (name, suite.threat.get("budget", place.threat_model.budget) if dose is None else dose): slot
-        for name, place in places.items() for slot, dose in reversed(list(enumerate(doses)))
+    at_dose = {
+        (name, suite.threat.get("budget", scenario.threat_model.budget) if dose is None else dose): i
+        for name, scenario in scenarios.items() for i, dose in reversed(list(enumerate(doses)))
     }  # fmt: skip
     held: dict[Key, dict[int, Row]] = {}
     hashes: dict[tuple[str, int | None, str], tuple[str, ...]] = {}
     for row in rows:
-        _belongs(row, suite, places)
-        slot = slots.get((row["scenario"], row["dose"]))
-        if slot is None:
+        _belongs(row, suite, scenarios)
+        dose = at_dose.get((row["scenario"], row["dose"]))
+        if dose is None:
             raise InputError(f"rows of {row['scenario']}: dose", row["dose"], f"one of the suite's doses {list(suite.doses)}")
         asked = row["scenario"], row["dose"], row["knowledge"]
         if asked not in hashes:
-            hashes[asked] = hashes_of(places[row["scenario"]], suite, row["dose"], row["knowledge"])
+            hashes[asked] = hashes_of(scenarios[row["scenario"]], suite, row["dose"], row["knowledge"])
         if row["config_hash"] not in hashes[asked]:
             what = f"rows of {row['scenario']}, {row['defence']}, {row['attack']}: config_hash"
             raise InputError(what, row["config_hash"], f"{' or '.join(hashes[asked])}: the scenario under the suite's own threat model")
-        key = Key(row["scenario"], slot, row["defence"], Column(row["attack"], row["knowledge"]))
+        key = Key(row["scenario"], dose, row["defence"], Attacker(row["attack"], row["knowledge"]))
         by_seed = held.setdefault(key, {})
         _same_cell(key, next(iter(by_seed.values()), row), row)
         _same_result(key, by_seed.setdefault(row["seed"], row), row)
@@ -149,36 +150,36 @@ def tabulate(rows: Iterable[Row], suite: Suite, added: Sequence[str] = (), withd
     seeds = _seeds(cells)
     defences = in_order({key.defence for key in cells}, suite.defences)
     listed = tuple(dict.fromkeys([*suite.attacks, *added]))
-    columns = columns_of((key.column for key in cells), listed)
+    attackers = attackers_of((key.attacker for key in cells), listed)
     clean: dict[tuple[str, str], list[Row]] = {}
-    for key in sorted(cells, key=lambda key: (key.slot, order(key.column.knowledge))):
-        if key.column.attack == CLEAN and all(row["status"] == "ok" for row in cells[key]):
+    for key in sorted(cells, key=lambda key: (key.dose, order(key.attacker.knowledge))):
+        if key.attacker.attack == CLEAN and all(row["status"] == "ok" for row in cells[key]):
             clean.setdefault((key.scenario, key.defence), cells[key])  # the same at every dose
-    shape = (len(defences), len(columns), len(doses))
-    harm = {name: np.full((*shape, len(seeds.get(name, ()))), np.nan) for name in places}
-    state = {name: np.full(shape, MISSING) for name in places}
+    shape = (len(defences), len(attackers), len(doses))
+    harm = {name: np.full((*shape, len(seeds.get(name, ()))), np.nan) for name in scenarios}
+    state = {name: np.full(shape, MISSING) for name in scenarios}
     for key, members in cells.items():
-        if key.column.attack == CLEAN:
+        if key.attacker.attack == CLEAN:
             continue
-        at = defences.index(key.defence), columns.index(key.column), key.slot
+        at = defences.index(key.defence), attackers.index(key.attacker), key.dose
         statuses = {row["status"] for row in members}
         state[key.scenario][at] = FAILED if "error" in statuses else SKIPPED if "skipped" in statuses else PLAYED
         if statuses == {"ok"}:
             harm[key.scenario][at] = [damaged(row, suite) for row in members]
     marks = {
-        mark: {column: any(bool(m[0].get(mark)) for key, m in cells.items() if key.column.attack == column.attack) for column in columns}
+        mark: {one: any(bool(m[0].get(mark)) for key, m in cells.items() if key.attacker.attack == one.attack) for one in attackers}
         for mark in ("optimal", "learned")
     }  # fmt: skip
     return Table(
-        suite, places, doses, defences, columns, seeds, cells, clean, harm, state, marks["optimal"], marks["learned"],
+        suite, scenarios, doses, defences, attackers, seeds, cells, clean, harm, state, marks["optimal"], marks["learned"],
         listed, frozenset(withdrawn), rows[0]["purpose"], str(rows[0].get("beacon", "")), sum(len(members) for members in cells.values()),
     )  # fmt: skip
 
 
-def hashes_of(place: Scenario, suite: Suite, dose: int | None, knowledge: str) -> tuple[str, ...]:
+def hashes_of(scenario: Scenario, suite: Suite, dose: int | None, knowledge: str) -> tuple[str, ...]:
     """Return the possible values of `config_hash` under the suite's threat model: without and with readings in the attacker's sight."""
     threat = suite.threat | {"knowledge": knowledge} | ({} if dose is None else {"budget": dose})
-    found = [place.with_threat(**threat | sight).config_hash for sight in ({}, {"sees_measurement": True})]
+    found = [scenario.with_threat(**threat | sight).config_hash for sight in ({}, {"sees_measurement": True})]
     return tuple(dict.fromkeys(found))
 
 
@@ -187,13 +188,13 @@ def doses_of(suite: Suite) -> tuple[int | None, ...]:
     return tuple(sorted(set(suite.doses), key=lambda dose: (dose is None, dose or 0)))
 
 
-def columns_of(played: Iterable[Column], listed: Sequence[str]) -> tuple[Column, ...]:
-    """Return columns of played and listed attacks: by the list, then by name, the least knowing first. Clean runs have none."""
+def attackers_of(played: Iterable[Attacker], listed: Sequence[str]) -> tuple[Attacker, ...]:
+    """Return played and listed attackers: by the list, then by name, the least knowing first. Clean runs have none."""
     granted: dict[str, set[str]] = {name: set() for name in listed}
-    for column in played:
-        granted.setdefault(column.attack, set()).add(column.knowledge)
+    for attacker in played:
+        granted.setdefault(attacker.attack, set()).add(attacker.knowledge)
     return tuple(
-        Column(name, level) for name in in_order(set(granted), listed) if name != CLEAN
+        Attacker(name, level) for name in in_order(set(granted), listed) if name != CLEAN
         for level in sorted(granted[name] or {"black"}, key=order)
     )  # fmt: skip
 
@@ -203,11 +204,11 @@ def in_order(names: set[str], first: Sequence[str]) -> tuple[str, ...]:
     return (*(name for name in dict.fromkeys(first) if name in names), *sorted(names - set(first)))
 
 
-def _belongs(row: Row, suite: Suite, places: dict[str, Scenario]) -> None:
+def _belongs(row: Row, suite: Suite, scenarios: dict[str, Scenario]) -> None:
     if row["suite"] != suite.name:
         raise InputError("rows: suite", row["suite"], f"rows of the suite {suite.name}")
-    if row["scenario"] not in places:
-        raise InputError("rows: scenario", row["scenario"], f"one of the suite's: {', '.join(places)}")
+    if row["scenario"] not in scenarios:
+        raise InputError("rows: scenario", row["scenario"], f"one of the suite's: {', '.join(scenarios)}")
     if row["knowledge"] not in KNOWLEDGE:
         raise InputError("rows: knowledge", row["knowledge"], f"one of {', '.join(KNOWLEDGE)}")
 
@@ -227,7 +228,7 @@ def _same_result(key: Key, one: Row, other: Row) -> None:
 
 def named(key: Key) -> str:
     """Return a cell as people read it, without its dose."""
-    return f"{key.scenario}, {key.defence}, {key.column.attack} ({key.column.knowledge})"
+    return f"{key.scenario}, {key.defence}, {key.attacker.attack} ({key.attacker.knowledge})"
 
 
 def _same_component(rows: Sequence[Row]) -> None:
@@ -247,6 +248,6 @@ def _seeds(cells: dict[Key, list[Row]]) -> dict[str, tuple[int, ...]]:
         mine = tuple(row["seed"] for row in cells[key])
         seeds, first = out.setdefault(key.scenario, (mine, key))
         if mine != seeds:
-            most = f"the {len(seeds)} seeds of {first.defence}, {first.column.attack}: play as many"
+            most = f"the {len(seeds)} seeds of {first.defence}, {first.attacker.attack}: play as many"
             raise InputError(f"rows of {named(key)}: seeds", f"{len(mine)} of them", most)
     return {name: seeds for name, (seeds, _) in out.items()}

@@ -183,9 +183,9 @@ def check_detection(
     """Play detection and stealth impact of entries of a board again, and compare them figure by figure, numbers to six digits.
 
     data: a board, as JSON; sample: number of entries, drawn by sample_seed (default: all that have figures); defences: only of these.
-    The report has `counts` of figures, `entries` (the same for each defence) and `findings`: figures that differ, by `field`, with what the
-    `board` says and what is `here`; `reasons`: why entries could not be played. Raises InputError for a board without such figures, and as
-    `check.check` does.
+    The report has `counts` of figures, and `entries`: the same for each defence. Its `findings` are figures that differ, by `field`, with
+    the value on the `board` and the value `here`. Its `reasons` say why entries could not be played. Raises InputError for a board
+    without such figures, and as `check.check` does.
     """
     board = read_board(data)
     suite = suite_of(board)

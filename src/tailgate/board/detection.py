@@ -2,8 +2,8 @@
 
 One threshold per defence, plant and wanted mean time between false alarms, found on clean runs of the plant's scenarios (calibrate). At
 that threshold attacks are played, and an alarm counts that comes within the metrics' deadline. The stealth attack aims just below the same
-threshold, so that a looser one lets it through with more. A defence without a threshold is watched: its score is held against one, which is
-the standard chi-square on its innovation for those that only filter (tailgate.core.score_threshold).
+threshold, so that a looser one lets it through with more. A defence without a threshold is watched: its score is compared with
+one from outside. Those that only filter are scored by the standard chi-square of the innovation (tailgate.core.score_threshold).
 """
 
 from __future__ import annotations
@@ -66,9 +66,9 @@ def plants(scenarios: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """
     out: dict[tuple[str, tuple[int, ...]], list[str]] = {}
     for name in scenarios:
-        place = load_scenario(name)
-        model = place.brief().model
-        out.setdefault((type(place.plant).__name__, (model.agents, model.states, len(model.sensors))), []).append(name)
+        scenario = load_scenario(name)
+        model = scenario.brief().model
+        out.setdefault((type(scenario.plant).__name__, (model.agents, model.states, len(model.sensors))), []).append(name)
     kinds = [kind for kind, _ in out]
     shape = "{} of {} agents with {} states and {} readings each"
     return {kind if kinds.count(kind) == 1 else shape.format(kind, *size): tuple(names) for (kind, size), names in out.items()}
@@ -91,9 +91,9 @@ class Found(NamedTuple):
     rarer: bool = False
 
 
-def _found(defence: str, places: tuple[str, ...], hours: float, effort: Effort) -> Found:
+def _found(defence: str, scenarios: tuple[str, ...], hours: float, effort: Effort) -> Found:
     try:
-        made = threshold(defence, places, float(hours), effort.onsets, effort.most_steps)
+        made = threshold(defence, scenarios, float(hours), effort.onsets, effort.most_steps)
     except InputError as error:
         if error.field != "hours":
             raise
@@ -108,13 +108,12 @@ def detection(
     suite: Suite, defences: Sequence[str], attacks: Sequence[str], effort: Effort = EFFORT, *, dose: int | None = None, beacon: str = "",
     progress: Progress | None = None,
 ) -> Data:  # fmt: skip
-    """Return the field `detection` of a board: the share of attacked episodes with an alarm within the deadline, and the median delay
-    [steps].
+    """Return the field `detection` of a board: shares of attacked episodes with an alarm in time, and median delays [steps].
 
-    Played are the suite's nominal scenarios, under its threat model, at its middle dose unless given; thresholds are found on the
-    clean runs of all scenarios of a plant together. `watched`: the threshold is held against the score of a defence that has none; `rarer`:
-    no threshold alarms as often as wanted, lower ones do more often and this one more rarely. `without` lists defences without figures, and
-    why: a mean time that is out of reach.
+    The suite's nominal scenarios are played under its threat model, at its middle dose unless given. Thresholds are found on the clean
+    runs of all scenarios of a plant together. `watched`: the threshold is compared with the score of a defence that has none. `rarer`: no
+    threshold alarms as often as wanted; lower ones alarm more often, this one more rarely. `without` lists defences without figures,
+    with the reason: a mean time that is out of reach.
     """
     update = progress or (lambda *_: None)
     found: list[Data] = []
@@ -160,9 +159,9 @@ def stealth_impact(
 ) -> list[Data] | None:  # fmt: skip
     """Return the field `stealth` of an entry: the error that the stealth attack reaches per time, by the time between false alarms.
 
-    `deviation` [m/s] is the median of episodes, the most of scenarios; `low` and `high` are its limits of 95 %, which hold together for all
-    scenarios, null for few episodes; `reason` says why there is none. `threshold` is that of the plant where the deviation is. None where
-    no threshold was found. Scenarios, threat model and dose are those of `detection`.
+    `deviation` [m/s] is the median of episodes, the most of scenarios; `reason` says why there is none. `low` and `high` are its limits of
+    95 %, which hold together for all scenarios; few episodes have none (null). `threshold` is that of the plant where the deviation is.
+    None where no threshold was found. Scenarios, threat model and dose are those of `detection`.
     """
     update = progress or (lambda *_: None)
     out: list[Data] = []

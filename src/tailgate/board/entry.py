@@ -29,18 +29,19 @@ Levels = dict[str, dict[str, Worst]]  # by defence and knowledge
 
 
 def middle(suite: Suite) -> int:
-    """Return the slot of the middle one of the doses that are shown; of all where none is named."""
+    """Return the index of the middle one of the doses that are shown; of all where none is named."""
     chosen = shown(suite)
     return chosen[len(chosen) // 2]
 
 
 def shown(suite: Suite) -> list[int]:
-    """Return slots of the doses that rates are shown at."""
+    """Return indices of the doses that rates are shown at."""
     doses = doses_of(suite)
-    return [slot for slot, dose in enumerate(doses) if dose in suite.shown] or list(range(len(doses)))
+    return [i for i, dose in enumerate(doses) if dose in suite.shown] or list(range(len(doses)))
 
 
-def entry_of(table: Table, defence: str, levels: dict[str, Worst], slot: int, origins: dict[str, Row], asked: list[Asked] | None) -> Data:
+def entry_of(table: Table, defence: str, levels: dict[str, Worst], dose: int, origins: dict[str, Row], asked: list[Asked] | None) -> Data:
+    """Return the entry of a defence that is made of rows: status, gates, flags, worst episode and figures."""
     rows = [row for key in sorted(table.cells) if key.defence == defence for row in table.cells[key]]
     uses = [str(use) for use in rows[0]["uses"]]
     card = _card(defence)
@@ -57,32 +58,32 @@ def entry_of(table: Table, defence: str, levels: dict[str, Worst], slot: int, or
     return {
         "defence": defence, "card": None if card is None else card.card(), "uses": uses, "class": class_of(uses),
         "status": status, "why": why, "gates": found, "rank": None, "clean": _clean(table, defence),
-        "flags": flags(table, defence, levels, slot, origins), "worst_episode": _episode(table, whole, slot), "stealth": None,
-    } | of_worst(table, levels, slot)  # fmt: skip
+        "flags": flags(table, defence, levels, dose, origins), "worst_episode": _episode(table, whole, dose), "stealth": None,
+    } | of_worst(table, levels, dose)  # fmt: skip
 
 
-def extended(entry: Data, table: Table, levels: dict[str, Worst], slot: int, trained: dict[str, str], added: Collection[str]) -> Data:
+def extended(entry: Data, table: Table, levels: dict[str, Worst], dose: int, trained: dict[str, str], added: Collection[str]) -> Data:
     """Return an entry of a board with more attacks, which have rows: shares of damage, status, flags and worst episode.
 
-    Its clean runs and gates stay as they are, and so do the suite's trainings that it met, and all that only rows can say of attacks that
-    it had met. trained: the defence that each learned attack was trained on.
+    Its clean runs, its gates and the suite's trainings that it met stay as they are. So does everything that needs the rows of attacks
+    that it had met. trained: the defence that each learned attack was trained on.
     """
-    out = entry | of_worst(table, levels, slot)
+    out = entry | of_worst(table, levels, dose)
     if entry["status"] != "unranked" and (why := _incomplete(table, levels["black"])):
         out |= {"status": "unranked", "why": why, "rank": None}
     whole, old = {k: worst for k, worst in levels.items() if worst.complete}, entry["worst_episode"]
-    hit = next(((worst, at) for at in (slot, *shown(table.suite)) for worst in whole.values() if worst.at(at)[1] > 0.0), None)
+    hit = next(((worst, at) for at in (dose, *shown(table.suite)) for worst in whole.values() if worst.at(at)[1] > 0.0), None)
     if hit is None:
-        new = _episode(table, whole, slot)
+        new = _episode(table, whole, dose)
         out["worst_episode"] = min((row for row in (old, new) if row is not None), key=_margin, default=None)
     elif hit[0].named(hit[0].at(hit[1])[0])["attack"] in added:
-        out["worst_episode"] = _episode(table, whole, slot)
+        out["worst_episode"] = _episode(table, whole, dose)
     own = any(trained.get(attack) == entry["defence"] for attack in added)
-    said = of_attacks(table, entry["defence"], levels, slot, trained)
-    return out | {"flags": [*dict.fromkeys([*standing(entry["flags"], levels, slot, added, own), *said])]}
+    said = of_attacks(table, entry["defence"], levels, dose, trained)
+    return out | {"flags": [*dict.fromkeys([*standing(entry["flags"], levels, dose, added, own), *said])]}
 
 
-def of_worst(table: Table, levels: dict[str, Worst], slot: int) -> Data:
+def of_worst(table: Table, levels: dict[str, Worst], dose: int) -> Data:
     """Return the figures of an entry that are shares of damage: critical doses, rates and robustness."""
     whole = {k: worst for k, worst in levels.items() if worst.complete}
     critical: dict[tuple[tuple[str, int], ...], Data | None] = {}
@@ -92,7 +93,7 @@ def of_worst(table: Table, levels: dict[str, Worst], slot: int) -> Data:
     return {
         "critical_dose": {k: critical[tuple(worst.pairs)] if k in whole else None for k, worst in levels.items()},
         "rates": [worst.rate(s) for s in shown(table.suite) for worst in whole.values()],
-        "robustness": _robustness(table, whole.get("black"), slot),
+        "robustness": _robustness(table, whole.get("black"), dose),
     }
 
 
@@ -128,8 +129,8 @@ def _incomplete(table: Table, worst: Worst) -> str:
         return "incomplete: no attack was played"
     name, i = worst.lost[0]
     index = table.defences.index(worst.defence)
-    slot = int(np.argmax(table.state[name][index, i] != PLAYED))
-    key = Key(name, slot, worst.defence, table.columns[i])
+    dose = int(np.argmax(table.state[name][index, i] != PLAYED))
+    key = Key(name, dose, worst.defence, table.attackers[i])
     reason = next((row["reason"] for row in table.cells.get(key, ()) if row["status"] != "ok"), "not played")
     attacks = len({i for _, i in worst.lost})
     return f"incomplete: {attacks} {'attack' if attacks == 1 else 'attacks'} without full figures, first {named(key)}: {reason}"
@@ -168,10 +169,10 @@ def _unmet(table: Table, defence: str, origins: dict[str, Row], asked: list[Aske
     row = next(rows[0] for key, rows in table.cells.items() if key.defence == defence)
     own = defence, row["defence_digest"], row.get("versions", {}).get("defence", 1)
     met = [
-        (origins[column.attack], {name for name in table.scenarios if (table.state[name][index, i] == PLAYED).all()})
-        for i, column in enumerate(table.columns)
-        if column.attack in origins and column.attack not in table.withdrawn
-        and tuple(origins[column.attack].get(key, 1) for key in ("defence", "digest", "version")) == own
+        (origins[attacker.attack], {name for name in table.scenarios if (table.state[name][index, i] == PLAYED).all()})
+        for i, attacker in enumerate(table.attackers)
+        if attacker.attack in origins and attacker.attack not in table.withdrawn
+        and tuple(origins[attacker.attack].get(key, 1) for key in ("defence", "digest", "version")) == own
     ]  # fmt: skip
     if not asked:
         met = [(origin, played) for origin, played in met if played == set(table.scenarios)]
@@ -196,12 +197,12 @@ def _clean(table: Table, defence: str) -> dict[str, Data]:
     return out
 
 
-def _episode(table: Table, whole: dict[str, Worst], slot: int) -> Row | None:
+def _episode(table: Table, whole: dict[str, Worst], dose: int) -> Row | None:
     """Return the worst episode: a damaged one of the worst attack at the middle dose, else at the smallest shown dose with damage.
 
     The least knowing attacker comes first. Where nothing is damaged, it is the episode of all attacks and shown doses that came nearest.
     """
-    for at in (slot, *shown(table.suite)):
+    for at in (dose, *shown(table.suite)):
         for worst in whole.values():
             pair, share = worst.at(at)
             if share > 0.0:
@@ -217,16 +218,16 @@ def _margin(row: Row) -> float:
     return float(row["min_gap"] if has_road(row) else -row["max_error"])
 
 
-def _robustness(table: Table, worst: Worst | None, slot: int) -> list[Data]:
+def _robustness(table: Table, worst: Worst | None, dose: int) -> list[Data]:
     """Return the undamaged share where the plant is another one, and its change from the worst of the nominal scenarios."""
     if worst is None:
         return []
-    base = worst.undamaged(worst.at(slot, table.nominal())[0], slot)
+    base = worst.undamaged(worst.at(dose, table.nominal())[0], dose)
     out = []
     for name in table.suite.robustness:
         if any(scenario == name for scenario, _ in worst.pairs):
-            pair, _ = worst.at(slot, [name])
-            value, low = worst.undamaged(pair, slot), 1.0 - worst.bounds(slot, [name])[1]
+            pair, _ = worst.at(dose, [name])
+            value, low = worst.undamaged(pair, dose), 1.0 - worst.bounds(dose, [name])[1]
             out.append({
                 "scenario": name, "undamaged": {"value": value, "low": low}, "change": value - base, "worst": worst.named(pair),
             })  # fmt: skip

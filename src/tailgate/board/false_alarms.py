@@ -1,7 +1,7 @@
 """False alarms at a threshold of the detection board, on fresh clean runs of every scenario of a suite.
 
-A threshold is found on all scenarios of a plant together, whose vehicle and sensors the defence knows. Elsewhere the alarm may
-come more often, and within a drive it may come early or late: a filter with a constant gain alarms while it settles.
+A threshold is found on all scenarios of a plant together, whose vehicle and sensors the defence knows. Elsewhere the alarm may come more
+often. Within a drive it may come early or late: a filter with a constant gain alarms while it settles.
 """
 
 from __future__ import annotations
@@ -49,10 +49,12 @@ class Drives:
 def false_alarms(suite: Suite, detected: Sequence[Data], wanted: int, most_steps: int, *, beacon: str = "") -> list[Data]:
     """Return the field `alarms` of a detection board: false alarms of each threshold in `detected`, in each scenario of its plant.
 
-    Each line has the `onsets` in `running` hours, their `dispersion` by drives, the mean time between them with its limits [h] (`mean`,
-    None without any, `low`, `high`), how many of them came in the `first` half of the drive, and how many drives had more of them `early`
-    and `late`. A run lasts as long as `wanted` false alarms should take, or `most_steps` steps if that is less. No two scenarios of a plant
-    share a seed: a filter that knows its input sees the noise alone, and would see it twice.
+    A run lasts as long as `wanted` false alarms should take, or `most_steps` steps if that is less. No two scenarios of a plant share a
+    seed: a filter that knows its input sees the noise alone, and would see it twice. Each line has
+
+    - the `onsets` in `running` hours, and their `dispersion` by drives;
+    - the time between them [h]: `mean` (None without any) with its limits `low` and `high`;
+    - the number of onsets in the `first` half of the drive, and of drives with more of them `early` and `late`.
     """
     out, done = [], set[tuple[str, tuple[str, ...], float]]()
     for line in detected:

@@ -1,7 +1,7 @@
 """Gates of the safety board: the cost of a defence when nobody attacks, paired by episode with the undefended car.
 
-For gap, jerk and distance both the median and the mean of the ratios count, whichever is worse: a median alone would allow a defence to
-ruin almost half of its episodes. And nearly all episodes have to get nearly as far.
+For gap, jerk and distance the worse of the median and the mean of the ratios counts. A median alone would allow a defence to ruin almost
+half of its episodes. In addition nearly all episodes have to get nearly as far.
 """
 
 from __future__ import annotations
@@ -64,13 +64,13 @@ def _of(table: Table, defence: str, scenario: str) -> list[Gate]:
     ]
 
 
-def _false_alarms(table: Table, scenario: str, own: list[Row]) -> Gate:
+def _false_alarms(table: Table, name: str, own: list[Row]) -> Gate:
     """Return the gate that fails an alarm which is on more than off, if the detection board has no threshold for it."""
     share = float(np.mean([row["alarm_rate"] for row in own]))
-    place = table.scenarios[scenario]
+    scenario = table.scenarios[name]
     onsets = sum(row["alarm_onsets"] for row in own)
-    often = onsets * HOURS * HOUR > len(own) * place.horizon * place.brief().model.dt
-    return _gate("false alarms", scenario, share, ALARMED, not (share > ALARMED and often))
+    often = onsets * HOURS * HOUR > len(own) * scenario.horizon * scenario.brief().model.dt
+    return _gate("false alarms", name, share, ALARMED, not (share > ALARMED and often))
 
 
 def _worse(of: Callable[[float, float], float], values: list[float]) -> float | None:

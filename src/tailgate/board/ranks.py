@@ -13,11 +13,11 @@ from tailgate.evaluation.paired import Harm, compare, duel, outdone
 
 from .entry import Levels
 from .schema import Data
-from .update import Beside
+from .update import KeptPart
 from .worst import Worst
 
 
-def rank(found: list[Data], levels: Levels, slot: int, alpha: float, held: Beside | None) -> list[Data]:
+def rank(found: list[Data], levels: Levels, dose: int, alpha: float, held: KeptPart | None) -> list[Data]:
     """Return the comparisons within each class, and put the rank sets into the entries that take one.
 
     Raises InputError where comparisons that a board has of entries that stay do not fit their cells.
@@ -27,8 +27,8 @@ def rank(found: list[Data], levels: Levels, slot: int, alpha: float, held: Besid
     known = [] if held is None else [pair for pair in held.board["comparisons"] if held.steady >= {pair["a"], pair["b"]}]
     for group in dict.fromkeys(entry["class"] for entry in ranked):
         members = [entry for entry in ranked if entry["class"] == group]
-        harm = {entry["defence"]: levels[entry["defence"]]["black"].all_harm(slot) for entry in members}
-        bounds = [] if held is None else _still_bound(held, levels, harm, slot, group)
+        harm = {entry["defence"]: levels[entry["defence"]]["black"].all_harm(dose) for entry in members}
+        bounds = [] if held is None else _still_bound(held, levels, harm, dose, group)
         pairs, ranks = compare(harm, group, alpha, [*known, *bounds])
         made = {(pair["a"], pair["b"]): pair for pair in pairs}
         for old in known:
@@ -44,7 +44,7 @@ def rank(found: list[Data], levels: Levels, slot: int, alpha: float, held: Besid
     return out
 
 
-def _still_bound(held: Beside, levels: Levels, harm: Mapping[str, Harm], slot: int, group: str) -> list[Data]:
+def _still_bound(held: KeptPart, levels: Levels, harm: Mapping[str, Harm], dose: int, group: str) -> list[Data]:
     """Return the comparisons of entries that have met more attacks since, as far as the old ones still bound p."""
     out = []
     for old in held.board["comparisons"]:
@@ -53,7 +53,7 @@ def _still_bound(held: Beside, levels: Levels, harm: Mapping[str, Harm], slot: i
             continue
         strong = b if weak == a else a
         before, now = Worst(held.before, weak, KNOWLEDGE[0], 0.05), levels[weak][KNOWLEDGE[0]]
-        if before.named(before.at(slot)[0]) != now.named(now.at(slot)[0]):
+        if before.named(before.at(dose)[0]) != now.named(now.at(dose)[0]):
             continue
         fresh, met = held.added.get(strong, frozenset()), levels[strong][KNOWLEDGE[0]]
         new = np.array([met.named(k)["attack"] in fresh for k in range(len(met.pairs))], bool)

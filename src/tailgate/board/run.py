@@ -7,7 +7,6 @@ import lzma
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from tailgate.base.errors import InputError
 from tailgate.base.reading import lines_of, parse_json
@@ -83,15 +82,17 @@ def _one_round(folder: Path, beacon: str) -> None:
         except (OSError, ValueError, AttributeError, EOFError, lzma.LZMAError):
             continue  # what is wrong with it is said where it is read
         if held != beacon:
-            raise InputError(f"beacon of {path}", held, f"{beacon!r}, as asked for now: another round needs a folder of its own")
+            raise InputError(f"beacon of {path}", held, f"{beacon!r}, as asked for now: use another folder for another round")
 
 
-def board_of(suite: Suite, folder: Path, beacon: str | None = None, keep: bool = False, **options: Any) -> Data:
+def board_of(
+    suite: Suite, folder: Path, beacon: str | None = None, keep: bool = False, *, require_adaptive: bool = True
+) -> Data:  # fmt: skip
     """Score all rows in a folder, with verified/*.json and the bounds of trust/trust.json, and write board.json. Returns the board.
 
-    It keeps what does not come from rows of the board.json that is there (`with_kept`); with `keep` also the entries that have no rows, or
-    not those of all their cells. Raises InputError where there are no rows, or rows of another round than `beacon`, for a report that
-    cannot be read or is of something else, and for rows that do not fit the board.
+    Fields of an earlier board.json that do not come from rows are kept (`with_kept`). With `keep` entries are kept too that have no rows,
+    or not those of all their cells. Raises InputError if there are no rows, if they are of another round than `beacon`, and if they do
+    not fit the board. The same goes for a report that cannot be read or has another subject.
     """
     files = files_of_rows(folder)
     if not files:
@@ -102,7 +103,7 @@ def board_of(suite: Suite, folder: Path, beacon: str | None = None, keep: bool =
         raise InputError("rows: version", min(other), f"{VERSION}, as the board's")
     board = score(
         (row for rows in parts.values() for row in rows), suite, attacks=list_of(suite, folder / LIST),
-        board=before if keep else None, **options,
+        board=before if keep else None, require_adaptive=require_adaptive,
     )  # fmt: skip
     if beacon is not None and board["suite"]["beacon"] != beacon:
         raise InputError("beacon", beacon, f"that of the rows, {board['suite']['beacon'] or 'which are of public seeds'}")

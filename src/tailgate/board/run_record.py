@@ -44,11 +44,11 @@ class Record:
             "workers": workers, "processor": processor(), "cores": cores(), "version": VERSION, "commit": commit(),
         }  # fmt: skip
 
-    def counting(self, told: Callable[..., None]) -> Callable[..., None]:
+    def counting(self, progress: Callable[..., None]) -> Callable[..., None]:
         """Return a progress that is called after each cell that was played."""
 
         def counted(*now: object) -> None:
-            told(*now)
+            progress(*now)
             self.played += self.suite.seeds
             if time.perf_counter() - self.written > EVERY:
                 self._write(None)
@@ -56,9 +56,9 @@ class Record:
         return counted
 
     def finish(self, rows: int) -> str:
-        """Write the record and return a line that tells it. rows: of the board. A command that played nothing changes no record."""
+        """Write the record and return a line that says it. rows: of the board. A command that played nothing changes no record."""
         if not self.played:
-            return "run: no row was played anew"
+            return "run: no new row was played"
         held = self._write(rows)
         commands = len(held.commands)
         return (

@@ -236,8 +236,10 @@ class Curve(Part):
 
 
 class Comparison(Part):
-    """Two defences on the same seeds; only_a: episodes in which a alone came to damage; weaker: the side that p speaks of; bound: whether
-    p is the largest that the numbers of damaged episodes allow, and these are as many as can be.
+    """Two defences on the same seeds.
+
+    only_a: episodes in which a alone came to damage; weaker: the side with more damage, which p is about. bound: p is the largest that the
+    numbers of damaged episodes allow, and these numbers are the largest possible.
     """
 
     class_: Text = Field("", alias="class")

@@ -15,11 +15,11 @@ from tailgate.studies.dose import CRITICAL
 from tailgate.training.adaptive import asked_of
 
 from .cells import cells_of, ordered
-from .damage import SKIPPED, Column, Table, tabulate
+from .damage import SKIPPED, Attacker, Table, tabulate
 from .entry import Levels, curves, entry_of, extended, middle
 from .ranks import rank
 from .schema import FORMAT, Data
-from .update import Beside, beside
+from .update import KeptPart, kept_part
 from .worst import Worst
 
 
@@ -29,10 +29,21 @@ def score(
 ) -> Data:  # fmt: skip
     """Return the board of a suite from its rows, in the format of decision record 14. The order of the rows changes nothing.
 
-    attacks: attacks that joined the suite's after it was published (`attack_list.read`); every defence has to have met these too.
-    require_adaptive: rank only defences that met an attack which was trained against them. board: of the same suite; its other entries stay
-    (`update.beside`), and ranks are made of both. shared: attacks on no list that every defence has to have met (`cells.shared_of`). Raises
-    InputError for rows that do not belong together, or do not fit the board.
+    Parameters
+    ----------
+    attacks
+        Attacks that joined the suite's after it was published (`attack_list.read`); every defence has to have met these too.
+    require_adaptive
+        Rank only defences that met an attack which was trained against them.
+    board
+        An earlier board of the suite: its other entries stay (`update.kept_part`), and ranks are made of both.
+    shared
+        Attacks on no list that every defence has to have met (`cells.shared_of`).
+
+    Raises
+    ------
+    InputError
+        For rows that do not belong together, or do not fit the board.
     """
     if not 0.0 < alpha < 1.0:
         raise InputError("alpha", alpha, "a number above 0 and below 1")
@@ -44,8 +55,8 @@ def score(
     joining = [text for text, line in lines.items() if line is not None]
     table = tabulate(rows, suite, joining, taken_back(attacks or ()))
     digests = {text: line.digest for text, line in lines.items() if line is not None}
-    slot = middle(suite)
-    held = None if board is None else beside(table, board, suite, alpha, require_adaptive, digests)
+    dose = middle(suite)
+    held = None if board is None else kept_part(table, board, suite, alpha, require_adaptive, digests)
     table = dataclasses.replace(table, shared=frozenset(shared)) if held is None else held.table
     kept = {} if held is None else held.entries
     origins = _origins(table)
@@ -55,8 +66,8 @@ def score(
     trained = {} if board is None else {a["attack"]: a["trained_on"] for a in board["attacks"] if a.get("trained_on")}
     trained |= {attack: str(origin["defence"]) for attack, origin in origins.items()}
     found = [
-        extended(kept[d], table, levels[d], slot, trained, added[d]) if d in added else dict(kept[d]) if d in kept
-        else entry_of(table, d, levels[d], slot, origins, asked) for d in table.defences
+        extended(kept[d], table, levels[d], dose, trained, added[d]) if d in added else dict(kept[d]) if d in kept
+        else entry_of(table, d, levels[d], dose, origins, asked) for d in table.defences
     ]  # fmt: skip
     cells = ordered([*cells_of(table), *(held.cells if held else ())], table)
     return {
@@ -66,7 +77,7 @@ def score(
             curve for d in table.defences
             for curve in (held.of("curves", d) if held is not None and d in kept and d not in added else curves(levels[d]))
         ],
-        "comparisons": rank(found, levels, slot, alpha, held), "detection": None,
+        "comparisons": rank(found, levels, dose, alpha, held), "detection": None,
     } | ({"trust": board["trust"]} if board is not None and board.get("trust") else {})  # fmt: skip
 
 
@@ -76,41 +87,42 @@ def _suite(table: Table, alpha: float) -> Data:
         "name": suite.name, "about": suite.about, "version": VERSION, "hash": suite.hash, "doses": list(table.doses),
         "shown": {str(dose): why for dose, why in suite.shown.items()}, "limit": CRITICAL, "bound": suite.bound, "alpha": alpha,
         "scenarios": [
-            {"name": name, "about": place.about, "robustness": name in suite.robustness, "hash": place.config_hash}
-            for name, place in table.scenarios.items()
+            {"name": name, "about": scenario.about, "robustness": name in suite.robustness, "hash": scenario.config_hash}
+            for name, scenario in table.scenarios.items()
         ],
         "episodes": max(len(seeds) for seeds in table.seeds.values()), "purpose": table.purpose, "beacon": table.beacon, "rows": table.rows,
     }  # fmt: skip
 
 
 def _attacks(
-    table: Table, lines: dict[str, Admitted | None], origins: dict[str, Row], cells: list[Data], held: Beside | None
+    table: Table, lines: dict[str, Admitted | None], origins: dict[str, Row], cells: list[Data], held: KeptPart | None
 ) -> list[Data]:  # fmt: skip
     out = []
     told = {} if held is None else {attack["attack"]: attack for attack in held.board["attacks"]}
-    files = {key.column.attack: rows[0]["attack_digest"] for key, rows in table.cells.items()}
-    for i, column in enumerate(table.columns):
-        line = lines.get(column.attack)
+    files = {key.attacker.attack: rows[0]["attack_digest"] for key, rows in table.cells.items()}
+    for i, attacker in enumerate(table.attackers):
+        line = lines.get(attacker.attack)
         left_out = [name for name in table.scenarios if (table.state[name][:, i] == SKIPPED).all()]
-        notes = [f"left out on {', '.join(left_out)}: {_reason(cells, column)}"] if left_out else []
-        notes += ["a computed optimum: shown, and not counted"] if table.optimal[column] else []
-        notes += ["taken back by an erratum: not counted"] if column.attack in table.withdrawn else []
+        notes = [f"left out on {', '.join(left_out)}: {_reason(cells, attacker)}"] if left_out else []
+        notes += ["a computed optimum: shown, and not counted"] if table.optimal[attacker] else []
+        notes += ["taken back by an erratum: not counted"] if attacker.attack in table.withdrawn else []
         out.append({
-            "attack": column.attack, "knowledge": column.knowledge, "learned": table.learned[column], "optimal": table.optimal[column],
-            "trained_on": origins.get(column.attack, {}).get("defence") or told.get(column.attack, {}).get("trained_on"),
-            "digest": told.get(column.attack, {}).get("digest") or files.get(column.attack) or None,
-            "admitted": None if line is None else line.as_data(), "note": "; ".join(notes), "withdrawn": column.attack in table.withdrawn,
-        } | ({"shared": True} if column.attack in table.shared.difference(table.listed) else {}))  # fmt: skip
+            "attack": attacker.attack, "knowledge": attacker.knowledge,
+            "learned": table.learned[attacker], "optimal": table.optimal[attacker],
+            "trained_on": origins.get(attacker.attack, {}).get("defence") or told.get(attacker.attack, {}).get("trained_on"),
+            "digest": told.get(attacker.attack, {}).get("digest") or files.get(attacker.attack) or None,
+            "admitted": None if line is None else line.as_data(), "note": "; ".join(notes), "withdrawn": attacker.attack in table.withdrawn,
+        } | ({"shared": True} if attacker.attack in table.shared.difference(table.listed) else {}))  # fmt: skip
     return out
 
 
-def _reason(cells: list[Data], column: Column) -> str:
+def _reason(cells: list[Data], attacker: Attacker) -> str:
     """Return why an attack was left out."""
-    mine = (c for c in cells if (c["attack"], c["knowledge"]) == column)
+    mine = (c for c in cells if (c["attack"], c["knowledge"]) == attacker)
     return next((str(c["reason"]) for c in mine if c["reason"] and not c["failed"]), "")
 
 
 def _origins(table: Table) -> dict[str, Row]:
     """Return how each learned attack of the table was trained: the rows' `trained`."""
-    found = ((key.column.attack, table.cells[key][0].get("trained")) for key in sorted(table.cells))
+    found = ((key.attacker.attack, table.cells[key][0].get("trained")) for key in sorted(table.cells))
     return {attack: origin for attack, origin in found if isinstance(origin, dict)}

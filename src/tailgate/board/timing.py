@@ -2,10 +2,10 @@
 
     timing advantage = P(damage | own schedule) - P(damage | yoked schedule)
 
-For each entry one trained attacker is measured: the one that does most damage among those whose files are here, at the dose where that is
-nearest to half of the board's episodes. Where all come to damage, or none, no schedule is better than another. On the board's episodes it
-has to do the damage that the board's cell says. It was chosen on them, so it is measured on the next ones of the round: at its own times,
-and at those of its twins (tailgate.studies.timing). Rows cannot tell it: a twin is no attack of the board.
+For each entry one trained attacker is measured: the most damaging one whose files are here. Its dose is the one where it damages nearest
+to half of the board's episodes. Where all come to damage, or none, no schedule is better than another. On the board's episodes it has to
+do the damage of the board's cell. It was chosen on them, so it is measured on the next ones of the round. It attacks at its own times,
+and at those of its twins (tailgate.studies.timing). Rows do not hold this: a twin is no attack of the board.
 """
 
 from __future__ import annotations

@@ -12,8 +12,8 @@ from tailgate.core.scenario import Suite
 from tailgate.core.threat import KNOWLEDGE
 from tailgate.evaluation.rows import CLEAN
 
-from .cells import cells_of, compared, joined, place_of, table_of
-from .damage import Column, Table
+from .cells import cell_key, cells_of, compared, joined, table_of
+from .damage import Attacker, Table
 from .files import amended, read_board
 from .schema import DETECTION, Board, Data
 from .worst import Worst
@@ -22,10 +22,8 @@ SAME = ("n", "failed", "damage", "hits", "decisions")  # of a cell that was play
 
 
 @dataclass(frozen=True)
-class Beside:
-    """The part of a board that stays: entries that were not played whole, their cells, and the table that these and the rows make
-    together.
-    """
+class KeptPart:
+    """The part of a board that stays: entries that were not played whole, their cells, and the table of these and the rows."""
 
     board: Data
     table: Table
@@ -40,14 +38,24 @@ class Beside:
         return [line for line in self.board[part] if line["defence"] == defence]
 
 
-def beside(table: Table, board: Data, suite: Suite, alpha: float, require_adaptive: bool, digests: Mapping[str, str]) -> Beside:
-    """Return what stays of a board next to a table of rows.
+def kept_part(table: Table, board: Data, suite: Suite, alpha: float, require_adaptive: bool, digests: Mapping[str, str]) -> KeptPart:
+    """Return what stays of a board when a table of rows is added.
 
     A defence whose rows cover all cells that the board has of it is made of rows. Others stay as the board has them, or meet in rows
-    attacks that they had not met. Cells that both have must come out equal; their damaged episodes are then known, if they were not. board:
-    JSON that `read_board` has read; digests: of the files of the attacks that joined the list. Raises InputError for a board of another
-    suite, round, purpose, alpha, list of attacks or rule of who is ranked, for rows that differ from it, for new cells of an attack that a
-    defence has met already, and where an entry that stays would change by anything but its own rows.
+    attacks that they had not met. Cells that both have must come out equal; their damaged episodes are then known, if they were not.
+
+    Parameters
+    ----------
+    board
+        JSON that `read_board` has read.
+    digests
+        Digests of the files of attacks that joined the list.
+
+    Raises
+    ------
+    InputError
+        For a board of another suite, round, purpose, alpha, list of attacks or ranking rule; for rows that differ from it; for new cells
+        of an attack that a defence has met already; and if an entry that stays would change by anything but its own rows.
     """
     said = {"beacon": "", "require_adaptive": True} | {key: value for key, value in board["suite"].items() if value is not None}
     mine = {"hash": suite.hash, "purpose": table.purpose, "beacon": table.beacon, "alpha": alpha, "require_adaptive": require_adaptive}
@@ -57,38 +65,38 @@ def beside(table: Table, board: Data, suite: Suite, alpha: float, require_adapti
     for attack in board["attacks"]:
         if (line := attack.get("admitted")) and (digest := digests.get(attack["attack"], line["digest"])) != line["digest"]:
             raise InputError(f"board: digest of {attack['attack']}", line["digest"], f"{digest}, as on the list: play the whole suite")
-    new = {place_of(cell): cell for cell in cells_of(table)}
-    told = {place: cell["hits"] for place, cell in new.items()}
-    held = table_of(board | {"cells": [cell | {"hits": told.get(place_of(cell), cell.get("hits"))} for cell in board["cells"]]}, suite)
+    new = {cell_key(cell): cell for cell in cells_of(table)}
+    hits = {key: cell["hits"] for key, cell in new.items()}
+    held = table_of(board | {"cells": [cell | {"hits": hits.get(cell_key(cell), cell.get("hits"))} for cell in board["cells"]]}, suite)
     for name, seeds in held.seeds.items():
         if table.seeds.get(name, ()) != seeds:
             raise InputError(f"rows of {name}: seeds", f"{len(table.seeds.get(name, ()))} of them", f"the board's, which are {len(seeds)}")
     if other := ({*held.listed} - held.withdrawn) ^ ({*held.listed} & {*table.listed} - table.withdrawn):
         raise InputError("board: attacks", min(other), "the list of attacks that is here: play the whole suite")
-    files = {key.column.attack: rows[0]["attack_digest"] for key, rows in table.cells.items()}
+    files = {key.attacker.attack: rows[0]["attack_digest"] for key, rows in table.cells.items()}
     entries: dict[str, Data] = {}
     cells: list[Data] = []
     added: dict[str, frozenset[str]] = {}
     steady: set[str] = set()
     for entry in board["entries"]:
         name = entry["defence"]
-        old = {place_of(cell): cell for cell in board["cells"] if cell["defence"] == name}
-        again = {place: cell for place, cell in new.items() if cell["defence"] == name}
-        for place in (place for place in again if place in old):
-            if off := [field for field in SAME if old[place].get(field) is not None and old[place][field] != again[place][field]]:
-                wanted = f"{old[place][off[0]]}, as the board has it: else play the whole suite"
-                raise InputError(f"rows of {_said([place])}: {off[0]}", again[place][off[0]], wanted)
+        old = {cell_key(cell): cell for cell in board["cells"] if cell["defence"] == name}
+        again = {key: cell for key, cell in new.items() if cell["defence"] == name}
+        for key in (key for key in again if key in old):
+            if off := [field for field in SAME if old[key].get(field) is not None and old[key][field] != again[key][field]]:
+                wanted = f"{old[key][off[0]]}, as the board has it: else play the whole suite"
+                raise InputError(f"rows of {_said([key])}: {off[0]}", again[key][off[0]], wanted)
         steady |= {name} if again.keys() <= old.keys() else set()
-        lost = [place for place, cell in old.items() if place not in again and cell["attack"] not in held.withdrawn]
+        lost = [key for key, cell in old.items() if key not in again and cell["attack"] not in held.withdrawn]
         if again and not lost:
             continue
-        met, more = {cell["attack"] for cell in old.values()}, [place for place in again if place not in old]
-        if late := [place for place in more if place[3] in met]:
+        met, more = {cell["attack"] for cell in old.values()}, [key for key in again if key not in old]
+        if late := [key for key in more if key[3] in met]:
             raise InputError(f"rows of {name}", _said(late), f"rows of all {len(old)} cells that the board has, {_said(lost)} among them")
         entries[name] = entry
         if more:
-            added[name] = frozenset(place[3] for place in more)
-        cells += [cell | {"hits": told[place]} if place in again else cell for place, cell in old.items()]
+            added[name] = frozenset(key[3] for key in more)
+        cells += [cell | {"hits": hits[key]} if key in again else cell for key, cell in old.items()]
     if CLEAN not in table.defences and CLEAN in held.defences and not entries.keys() >= {*table.defences}:
         raise InputError("rows: defence", list(table.defences), f"{CLEAN} too: what a defence costs is measured against it")
     shared = {cell["attack"] for cell in cells} & {cell["attack"] for cell in new.values() if cell["defence"] not in entries}
@@ -99,25 +107,26 @@ def beside(table: Table, board: Data, suite: Suite, alpha: float, require_adapti
     for name in entries:
         before, now = _counted(held, name), _counted(both, name)
         if odd := {pair for pair in before ^ now if pair in before or pair[1].attack not in added.get(name, ())}:
-            where, column, _ = min(odd)
+            where, attacker, _ = min(odd)
             wanted = f"an attack that counts against {name} as before: play the whole suite"
-            raise InputError(f"rows of {column.attack} on {where}", "played", wanted)
+            raise InputError(f"rows of {attacker.attack} on {where}", "played", wanted)
     own = sum(len(rows) for rows in both.cells.values())
     whole = dataclasses.replace(both, rows=own + sum(len(held.seeds[c["scenario"]]) for c in cells))
-    return Beside(board, whole, entries, cells, held, added, frozenset(steady))
+    return KeptPart(board, whole, entries, cells, held, added, frozenset(steady))
 
 
-def _counted(table: Table, defence: str) -> set[tuple[str, Column, bool]]:
-    """Return scenario and column of every attack that counts against a defence, and if its figures are whole."""
+def _counted(table: Table, defence: str) -> set[tuple[str, Attacker, bool]]:
+    """Return scenario and attacker of every attack that counts against a defence, and if its figures are whole."""
     if defence not in table.defences:
         return set()
     worst = Worst(table, defence, KNOWLEDGE[-1], 0.05)
-    return {(name, table.columns[i], (name, i) in worst.lost) for name, i in worst.pairs}
+    return {(name, table.attackers[i], (name, i) in worst.lost) for name, i in worst.pairs}
 
 
-def _said(places: list[tuple[Any, ...]]) -> str:
-    scenario, dose, defence, attack, _ = places[0]
-    more = f", and {len(places) - 1} more" if len(places) > 1 else ""
+def _said(keys: list[tuple[Any, ...]]) -> str:
+    """Return the first cell in words, and how many more there are."""
+    scenario, dose, defence, attack, _ = keys[0]
+    more = f", and {len(keys) - 1} more" if len(keys) > 1 else ""
     return f"{scenario}, {defence}, {attack}, dose {dose}{more}"
 
 
@@ -140,8 +149,8 @@ def with_kept(board: Data, old: Data) -> Data:
 
 def _unchanged(board: Data, old: Board) -> dict[str, int]:
     """Return defences whose old cells are all on the board as they were, and how many cells they have there."""
-    cells = {place_of(cell): cell for cell in board["cells"]}
-    moved = {part.defence for part in old.cells if (here := cells.get(place_of(part.model_dump()))) is None or compared(part, here).why}
+    cells = {cell_key(cell): cell for cell in board["cells"]}
+    moved = {part.defence for part in old.cells if (here := cells.get(cell_key(part.model_dump()))) is None or compared(part, here).why}
     names = [entry.defence for entry in old.entries if entry.defence not in moved]
     counts = {name: sum(cell["defence"] == name for cell in board["cells"]) for name in names}
     return {name: n for name, n in counts.items() if n}

@@ -59,8 +59,8 @@ def with_verified(board: Data, folder: Path, files: Mapping[str, Mapping[str, in
     """Return the board with `verified` in each entry: {"rows", "verified", "differs", "unchecked"}, or null where nobody has looked.
 
     files: SHA-256 of each file of rows that the board is made of, and how many rows of each defence it has. A report on any other file, or
-    on one that has changed since, counts for nothing; of two reports on one file the one counts that asked for more rows. A defence has
-    figures only where rows of every file that it is in were played again.
+    on one that has changed since, does not count. If two reports are on one file, the one counts that asked for more rows. A defence has
+    figures only if rows of all its files were played again.
     """
     looked: dict[tuple[str, str], Again] = {}
     for path in sorted(folder.glob("*.json")):

@@ -1,7 +1,6 @@
 """The worst over attacks and scenarios at each dose: rates, curves and the critical dose.
 
-Every value here falls or stays when an attack or a scenario is added: values are maxima of damage, and limits are corrected for their
-number.
+No value here rises when an attack or a scenario is added: values are maxima of damage, and limits are corrected for their number.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ class Worst:
 
     @cached_property
     def pairs(self) -> list[tuple[str, int]]:
-        """Return (scenario, column) of every attack that has a meaning there.
+        """Return (scenario, index of the attacker) of every attack that has a meaning there.
 
         An attack that is not asked of everybody counts against the defences that it was played against.
         """
@@ -43,7 +42,7 @@ class Worst:
         for name in self.table.scenarios:
             applies, mine = self.table.applies(name), self.table.state[name][index]
             for i in self.table.known(self.knowledge):
-                if applies[i] and (self.table.columns[i].attack in self.table.asked or (mine[i] != MISSING).any()):
+                if applies[i] and (self.table.attackers[i].attack in self.table.asked or (mine[i] != MISSING).any()):
                     out.append((name, i))
         return out
 
@@ -55,80 +54,80 @@ class Worst:
 
     @property
     def complete(self) -> bool:
-        """Return if every figure of this class can be had, and an attacker who knows just this was met: else it would be a lower one's."""
-        return any(self.table.columns[i].knowledge == self.knowledge for _, i in self.pairs) and not self.lost
+        """Return if no cell of this class is missing, and an attacker who knows just this was met: else it would be a lower class's."""
+        return any(self.table.attackers[i].knowledge == self.knowledge for _, i in self.pairs) and not self.lost
 
     @cached_property
     def shares(self) -> Array:
-        """Return (pairs, slots) share of damaged episodes."""
+        """Return (pairs, doses) share of damaged episodes."""
         return np.array([self._harm(name, i).mean(axis=-1) for name, i in self.pairs])
 
     def _harm(self, name: str, i: int) -> Array:
         return np.asarray(self.table.harm[name][self.table.defences.index(self.defence), i])
 
-    def at(self, slot: int, scenarios: list[str] | None = None) -> tuple[int, float]:
+    def at(self, dose: int, scenarios: list[str] | None = None) -> tuple[int, float]:
         """Return (pair, damaged share) of the worst attack at a dose, in some scenarios or all; the first of equal ones."""
-        shares = self.shares[:, slot].copy()
+        shares = self.shares[:, dose].copy()
         if scenarios is not None:
             shares[[name not in scenarios for name, _ in self.pairs]] = -1.0
         worst = int(np.argmax(shares))
         return worst, float(shares[worst])
 
-    def undamaged(self, pair: int, slot: int) -> float:
+    def undamaged(self, pair: int, dose: int) -> float:
         """Return the undamaged share of a pair, as a quotient of whole numbers."""
-        _, harm = self.harm(pair, slot)
+        _, harm = self.harm(pair, dose)
         return float((len(harm) - harm.sum()) / len(harm))
 
     def named(self, pair: int) -> Data:
         name, i = self.pairs[pair]
-        return {"scenario": name, "attack": self.table.columns[i].attack}
+        return {"scenario": name, "attack": self.table.attackers[i].attack}
 
-    def harm(self, pair: int, slot: int) -> tuple[tuple[int, ...], Array]:
+    def harm(self, pair: int, dose: int) -> tuple[tuple[int, ...], Array]:
         """Return seeds and damage (episodes,) of a pair."""
         name, i = self.pairs[pair]
-        return self.table.seeds[name], self._harm(name, i)[slot]
+        return self.table.seeds[name], self._harm(name, i)[dose]
 
-    def vague(self, pair: int, slot: int) -> bool:
+    def vague(self, pair: int, dose: int) -> bool:
         """Return if nobody knows which episodes of a pair came to damage."""
         name, i = self.pairs[pair]
-        return Key(name, slot, self.defence, self.table.columns[i]) in self.table.vague
+        return Key(name, dose, self.defence, self.table.attackers[i]) in self.table.vague
 
-    def rows(self, pair: int, slot: int) -> list[Row]:
+    def rows(self, pair: int, dose: int) -> list[Row]:
         """Return the rows of a pair at a dose, by seed; none of those that a board alone knows of."""
         name, i = self.pairs[pair]
-        return self.table.cells.get(Key(name, slot, self.defence, self.table.columns[i]), [])
+        return self.table.cells.get(Key(name, dose, self.defence, self.table.attackers[i]), [])
 
-    def all_harm(self, slot: int) -> Harm:
+    def all_harm(self, dose: int) -> Harm:
         """Return the damage of all pairs at a dose. Raises InputError for scenarios with other seeds: nothing would be paired."""
         found = {self.table.seeds[name] for name, _ in self.pairs}
         if len(found) != 1:
             raise InputError(f"rows of {self.defence}: seeds", f"{len(found)} sets of them", "the same seeds in every scenario")
-        harm = np.stack([self._harm(name, i)[slot] for name, i in self.pairs])
+        harm = np.stack([self._harm(name, i)[dose] for name, i in self.pairs])
         if np.isnan(harm).any():
             raise InputError(f"rows of {self.defence}", "attacks without full figures", "all episodes of every attack that counts")
-        return Harm(found.pop(), harm, self.at(slot)[0], np.array([self.vague(k, slot) for k in range(len(self.pairs))], bool))
+        return Harm(found.pop(), harm, self.at(dose)[0], np.array([self.vague(k, dose) for k in range(len(self.pairs))], bool))
 
-    def bounds(self, slot: int, scenarios: list[str] | None = None, sides: int = 1) -> tuple[float, float]:
+    def bounds(self, dose: int, scenarios: list[str] | None = None, sides: int = 1) -> tuple[float, float]:
         """Return limits of the worst damaged share that hold together for all pairs: alpha over their number, and over the sides."""
         chosen = [k for k, (name, _) in enumerate(self.pairs) if scenarios is None or name in scenarios]
         n = np.array([len(self.table.seeds[self.pairs[k][0]]) for k in chosen])
-        hits = np.round(self.shares[chosen, slot] * n)
+        hits = np.round(self.shares[chosen, dose] * n)
         low, high = limits(hits, n, self.alpha / (len(self.pairs) * sides))
         return float(low.max()), float(high.max())
 
-    def rate(self, slot: int) -> Data:
+    def rate(self, dose: int) -> Data:
         """Return the undamaged share against the worst, with its lower limit."""
-        pair, _ = self.at(slot)
+        pair, _ = self.at(dose)
         return {
-            "dose": self.table.doses[slot], "knowledge": self.knowledge,
-            "undamaged": {"value": self.undamaged(pair, slot), "low": 1.0 - self.bounds(slot)[1]},
+            "dose": self.table.doses[dose], "knowledge": self.knowledge,
+            "undamaged": {"value": self.undamaged(pair, dose), "low": 1.0 - self.bounds(dose)[1]},
             "worst": self.named(pair), "attacks": len({i for _, i in self.pairs}),
         }  # fmt: skip
 
     @cached_property
     def numbers(self) -> list[int]:
-        """Return slots of doses that are numbers."""
-        return [slot for slot, dose in enumerate(self.table.doses) if dose is not None]
+        """Return indices of doses that are numbers."""
+        return [i for i, dose in enumerate(self.table.doses) if dose is not None]
 
     @cached_property
     def _clean(self) -> list[tuple[str, Array]]:
@@ -150,10 +149,10 @@ class Worst:
                 "dose": 0, "value": float(hits[worst] / n[worst]), "low": float(low.max()), "high": float(high.max()),
                 "scenario": self._clean[worst][0], "attack": "none",
             })  # fmt: skip
-        for slot in self.numbers:
-            pair, share = self.at(slot)
-            low_, high_ = self.bounds(slot, sides=2)
-            out.append({"dose": self.table.doses[slot], "value": share, "low": low_, "high": high_, **self.named(pair)})
+        for dose in self.numbers:
+            pair, share = self.at(dose)
+            low_, high_ = self.bounds(dose, sides=2)
+            out.append({"dose": self.table.doses[dose], "value": share, "low": low_, "high": high_, **self.named(pair)})
         return out
 
     def curve(self) -> Data:
@@ -170,10 +169,10 @@ class Worst:
         """
         if not self.numbers:
             return None
-        doses = np.array([self.table.doses[slot] for slot in self.numbers], np.float64)
+        doses = np.array([self.table.doses[dose] for dose in self.numbers], np.float64)
         first = len(self.points) - len(doses)  # below the smallest dose nothing was played: a line down to no attack would be a guess
         line = fitted(np.array([point["value"] for point in self.points]))
-        low, high = np.array([self.bounds(slot, sides=2 * len(doses)) for slot in self.numbers]).T
+        low, high = np.array([self.bounds(dose, sides=2 * len(doses)) for dose in self.numbers]).T
         found = {
             "value": critical_dose(doses, line[first:], CRITICAL),
             "low": critical_dose(doses, np.minimum.accumulate(high[::-1])[::-1], CRITICAL),  # damage only rises with the dose

@@ -70,7 +70,7 @@ def _print(attack: str, admitted: bool, tests: list[dict[str, Any]]) -> None:
         rows.append((test["defence"], test["scenario"], test["worst"]["attack"] if test["worst"] else "-", *counts, p, sure))
     if telling:
         columns = ("defence", "scenario", "worst so far", "this alone", "that alone", "of", "p (Holm)", "more")
-        title = f"{attack} beside the worst on the list, at dose {tests[0]['dose']}: episodes that only one of them damages"
+        title = f"{attack} against the worst on the list, at dose {tests[0]['dose']}: episodes that only one of them damages"
         table(columns, rows, title)
     if silent := len(tests) - len(telling):
         pairs = f"in {silent} of {len(tests)} pairs of a defence and a scenario"

@@ -11,6 +11,7 @@ from tailgate.cli.shared import Commands, own_classes, working
 
 
 def add(actions: Commands) -> None:
+    """Add `attack` to the actions of a command."""
     command = actions.add_parser(
         "attack", help="train a suite's attackers against a defence, and play them on it",
         description="Train the learners that the suite names against the defence itself, black and grey box, and play their policies at "

@@ -14,7 +14,7 @@ def add(commands: Commands) -> None:
     """Add `bench` to the commands."""
     command = commands.add_parser(
         "bench", help="measure the speed of this package and of the peers that are installed, side by side",
-        description="Measure environments, estimators and solvers beside their peers, interleaved in one run, and judge the ratios by "
+        description="Measure environments, estimators and solvers next to their peers, interleaved in one run, and judge the ratios by "
         "their targets. Peers are extras; one that is not installed is reported as missing. Exit code 0 whatever the figures are: the "
         "machine may be busy. docs/speed.md says how it is done.",
     )  # fmt: skip

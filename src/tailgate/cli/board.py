@@ -19,10 +19,11 @@ from tailgate.cli.shared import Commands, add_options, own_classes, print_json, 
 
 
 def add(actions: Commands) -> None:
+    """Add `run`, `page` and `head` to the actions of `leaderboard`."""
     command = actions.add_parser(
         "run", help="play suites, score them, and build the page of their boards",
         description="Play every defence of the suites against every attack, score the rows, and build the page: OUT/SUITE/rows.jsonl.xz "
-        "(with --defence the rows have a file of their own), OUT/SUITE/board.json, OUT/page. Rows that `leaderboard attack` or `submit` "
+        "(with --defence the rows go to a separate file), OUT/SUITE/board.json, OUT/page. Rows that `leaderboard attack` or `submit` "
         "put below OUT/SUITE count as well. Interrupted, the same command goes on.",
     )  # fmt: skip
     command.add_argument("suites", nargs="+", metavar="SUITE", help="suites by name or YAML file")
@@ -50,7 +51,7 @@ def add(actions: Commands) -> None:
     page.set_defaults(run=_page)
     head = actions.add_parser("head", help="print the head of a board as a Markdown table")
     head.add_argument("board", metavar="FILE", help="board.json")
-    head.add_argument("--most", type=int, metavar="N", help="so many defences at most, the first in the order of the page (default: all)")
+    head.add_argument("--most", type=int, metavar="N", help="print at most N defences, the first in the order of the page (default: all)")
     head.set_defaults(run=_head)
 
 
@@ -68,7 +69,7 @@ def _run(options: argparse.Namespace) -> int:
         raise InputError("--attack", options.attack[0], "--keep-entries too: a board of some attacks alone would say too little")
     for name in ("unattacked", "score_only") if options.train else ():
         if getattr(options, name):
-            raise InputError("--train", True, f"no --{name.replace('_', '-')}: it trains and plays whoever was not attacked")
+            raise InputError("--train", True, f"no --{name.replace('_', '-')}: it attacks every defence that was not")
     sizes.check("workers", options.workers)
     out, started = Path(options.out), time.perf_counter()
     suites = [load_suite(name) for name in options.suites]
@@ -83,10 +84,10 @@ def _run(options: argparse.Namespace) -> int:
             folder = out / suite.name
             record = Record(suite, folder, options.workers)
             if not options.score_only:
-                told = record.counting(lambda name, done, total: update(name, done, total, cells(done, total)))
+                counting = record.counting(lambda name, done, total: update(name, done, total, cells(done, total)))
                 rows = play(
                     suite, folder, defences=options.defence, attacks=options.attack, workers=options.workers, beacon=options.beacon,
-                    board=kept.get(suite.name), progress=told,
+                    board=kept.get(suite.name), progress=counting,
                 )  # fmt: skip
                 print(f"rows: {rows}", file=sys.stderr)
             board = board_of(

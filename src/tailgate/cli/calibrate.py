@@ -11,6 +11,7 @@ from tailgate.cli.shared import Commands, own_classes, show, table, working
 
 
 def add(commands: Commands) -> None:
+    """Add `calibrate` to the commands."""
     command = commands.add_parser(
         "calibrate", help="find the threshold of a defence for a wanted mean time between false alarms",
         description="Play clean runs (no attack) and find the threshold at which the alarm goes on once in a wanted time. Alarms act on "

@@ -25,7 +25,7 @@ def add(actions: Commands) -> None:
         "zoo, and files of policies that are here are played; a board never makes this command import code.",
     )  # fmt: skip
     command.add_argument("board", metavar="FILE", help="board.json")
-    command.add_argument("--sample", type=int, metavar="N", help="so many cells, drawn at random (default: all)")
+    command.add_argument("--sample", type=int, metavar="N", help="check N cells, drawn at random (default: all)")
     add_options(command, "--sample-seed")
     command.add_argument("--defence", action="append", default=[], metavar="NAME", help="only the cells of these defences (repeatable)")
     add_options(command, "--workers")

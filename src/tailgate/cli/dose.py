@@ -12,6 +12,7 @@ from tailgate.cli.shared import Commands, add_options, counted, own_classes, say
 
 
 def add(commands: Commands) -> None:
+    """Add `dose-response` to the commands."""
     command = commands.add_parser(
         "dose-response", help="outcome against attack budget, and the dose at which an attack becomes critical",
         description="Play attacks at several budgets. The curve is a monotone regression; the critical dose is where it first exceeds the "

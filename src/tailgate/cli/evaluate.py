@@ -6,17 +6,22 @@ import argparse
 import dataclasses
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tailgate.base.files import aside, writable_directory
 from tailgate.cli.shared import Commands, add_options, counted, own_classes, show, table, tell, threat_of, working
 from tailgate.core.schema import scalar
 
+if TYPE_CHECKING:
+    from tailgate.core.scenario import Suite
+
+DEFAULT = "quick-v0"  # the suite if none is named
 AGAIN = 3  # rows of a defence that are played again
 REFUSED = "refused: the scenario does not grant it"
 
 
 def add(commands: Commands) -> None:
+    """Add `evaluate` to the commands."""
     command = commands.add_parser(
         "evaluate", help="play defences against attacks and write one row per episode",
         description="Play a suite, or the part of it that the options name. NAME: a registered component, NAME:key=value,key=value, "
@@ -42,9 +47,9 @@ def _evaluate(options: argparse.Namespace) -> int:
     own_classes()
     threat = threat_of(options)
     doses = None if options.dose is None else [scalar(d) for d in options.dose]
-    suite: Any = options.suite or "quick-v0"
+    suite: Suite | str = options.suite or DEFAULT
     if options.suite is None and options.scenario:  # a scenario by itself: what is not named is quick-v0's, but for the dose
-        suite = dataclasses.replace(load_suite(suite), name="custom", doses=(None,))
+        suite = dataclasses.replace(load_suite(DEFAULT), name="custom", doses=(None,))
     if options.plot:
         writable_directory(Path(options.plot), "plot")
     options.kept = f"the same command goes on with the rows of {options.out}" if options.out else "nothing is kept: --out FILE would"

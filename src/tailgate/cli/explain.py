@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import TYPE_CHECKING
 
 from tailgate.cli.shared import Commands, own_classes, show, table
 
+if TYPE_CHECKING:
+    from tailgate.engine.agreement import Untraced
+    from tailgate.engine.program import Program
+    from tailgate.engine.remembered import Programs
+
 
 def add(commands: Commands) -> None:
+    """Add `explain` to the commands."""
     command = commands.add_parser(
         "explain", help="whether a scenario, a defence and an attack are traced, and if not, why",
         description="Say whether the engine can trace environments of a scenario and a defence, and, with an attack, whole episodes. "
@@ -40,14 +46,14 @@ def explanation(scenario: str | None, defence: str | None, attack: str | None) -
     from tailgate.play.rollouts import rollout_of
 
     seat = Seat.make(scenario, defence)
-    made: dict[str, Any] = {"environments": programs_of(seat)}
+    made: dict[str, Programs | Untraced] = {"environments": programs_of(seat)}
     if attack is not None:
-        rival = Spec("attack", attack).make()
-        rival.prepare(seat.loop.brief)  # what does not fit says so
-        made |= {"episodes": commanded(seat.loop), "episodes, attack included": rollout_of(seat.loop, rival)}
+        attacker = Spec("attack", attack).make()
+        attacker.prepare(seat.loop.brief)  # raises if it does not fit
+        made |= {"episodes": commanded(seat.loop), "episodes, attack included": rollout_of(seat.loop, attacker)}
     return {what: {"why": held.why} if isinstance(held, Untraced) else _size(held.programs[0]) for what, held in made.items()}
 
 
-def _size(program: Any) -> dict[str, str]:
+def _size(program: Program) -> dict[str, str]:
     size, memory = program.size, program.stride // program.lanes
     return {"size": f"{size['nodes']} operations, {size['branches']} branches, {memory} bytes an episode"}

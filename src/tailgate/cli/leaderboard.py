@@ -10,6 +10,7 @@ from tailgate.cli.shared import Commands, add_options
 
 
 def add(commands: Commands) -> None:
+    """Add `leaderboard` to the commands."""
     command = commands.add_parser("leaderboard", help="score suites, attack and submit defences, verify rows, build pages")
     actions = command.add_subparsers(required=True, metavar="ACTION")
     for action in (board, attack, submit, verify, check, detect, clock, schedules, retrain, admit):

@@ -16,6 +16,7 @@ from tailgate.cli.shared import Commands, print_json
 
 
 def add(commands: Commands) -> None:
+    """Add `list` to the commands."""
     command = commands.add_parser("list", help="what there is: defences and their parts, attacks, the zoo, scenarios, suites; or a graph")
     groups = ["defences", "filters", "detectors", "mitigations", "attacks", "zoo", "scenarios", "suites"]
     command.add_argument("what", nargs="?", choices=groups, help="only these; attacks: with the zoo of trained policies")
@@ -88,16 +89,18 @@ def _draw(options: argparse.Namespace) -> int:
     from tailgate.core.drawing import draw_graph, edges
     from tailgate.core.scenario import load_scenario
 
-    place = load_scenario(options.graph)
-    brief = place.brief()
+    scenario = load_scenario(options.graph)
+    brief = scenario.brief()
     model, attacked = brief.model, [i for i in range(brief.model.agents) if brief.granted[i].any()]
-    path = Path(options.out or f"{place.name}.png")
-    title = f"{place.name}: double rings are open to attack" if model.agents > 1 else place.name
+    path = Path(options.out or f"{scenario.name}.png")
+    title = f"{scenario.name}: double rings are open to attack" if model.agents > 1 else scenario.name
     draw_graph(model, path, attacked, title)
-    facts = {"scenario": place.name, "agents": model.agents, "edges": len(edges(model.graph)), "attacked": attacked, "drawing": str(path)}
+    facts = {
+        "scenario": scenario.name, "agents": model.agents, "edges": len(edges(model.graph)), "attacked": attacked, "drawing": str(path),
+    }  # fmt: skip
     if options.json:
         print_json(facts)
     else:
         whom = ", ".join(map(str, attacked))
-        print(f"{place.name}: {model.agents} agents, {facts['edges']} edges, open to attack: {whom}; drawn in {path}")
+        print(f"{scenario.name}: {model.agents} agents, {facts['edges']} edges, open to attack: {whom}; drawn in {path}")
     return 0

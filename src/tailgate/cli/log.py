@@ -21,7 +21,7 @@ def add(commands: Commands) -> None:
     command.add_argument("--dev-episodes", type=int, default=25, metavar="N", help="development episodes per cell (default 25)")
     add_options(command, "--scenario")
     command.add_argument("--defence", action="append", metavar="NAME", help="a defence instead of the suite's standard one (repeatable)")
-    command.add_argument("--attack", action="append", metavar="NAME", help="an attack instead of the suite's (repeatable), beside none")
+    command.add_argument("--attack", action="append", metavar="NAME", help="an attack next to none, instead of the suite's (repeatable)")
     command.add_argument("--dose", action="append", metavar="STEPS", help="attack budget instead of the suite's middle one (repeatable)")
     command.add_argument("--json", action="store_true", help="print what was written as JSON")
     command.set_defaults(run=_log, kept="the same command goes on")

@@ -12,6 +12,7 @@ from tailgate.cli.shared import Commands, print_json, say
 
 
 def add(commands: Commands) -> None:
+    """Add `replay` to the commands."""
     command = commands.add_parser(
         "replay", help="play one episode again from its row and write a page of it",
         description="Play one episode again from its row, check its hash, and write one HTML page. Of the rows that the options leave, the "
@@ -67,8 +68,8 @@ def _replay(options: argparse.Namespace) -> int:
     elif options.size is not None or options.viewer != "auto":
         raise InputError("--video", None, "a file: --viewer and --size are those of a film")
     viewer = Viewer(options.viewer, _size(options.size))
-    guard = Spec("defence", options.defence or "none")
-    if guard.imports or guard.sandboxed or Spec("attack", options.attack or "none").imports:
+    defence = Spec("defence", options.defence or "none")
+    if defence.imports or defence.sandboxed or Spec("attack", options.attack or "none").imports:
         sys.path.insert(0, "")  # the class that the user names is looked for in the working directory, and nothing else is
     wanted = Filter(options.line, options.scenario, options.defence, options.attack, _dose(options.dose), options.seed)
     source = Path(options.rows)

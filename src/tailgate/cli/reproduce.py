@@ -16,6 +16,7 @@ from tailgate.cli.shared import Commands, print_json, say, table
 
 
 def add(commands: Commands) -> None:
+    """Add `reproduce` to the commands."""
     from tailgate.thesis import CHAPTERS
 
     command = commands.add_parser(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tailgate.cli.shared import Commands, add_options, counted, table, working
 
-WORDS = {"more": "do more", "equal": "yoked equals own", "unknown": "cannot be told"}
+WORDS = {"more": "do more", "equal": "yoked equals own", "unknown": "undecided"}
 
 
 def add(actions: Commands) -> None:

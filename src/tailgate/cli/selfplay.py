@@ -13,6 +13,7 @@ from tailgate.cli.shared import Commands, add_options, say, show, table
 
 
 def add(commands: Commands) -> None:
+    """Add `selfplay` to the commands."""
     from tailgate.training.selfplay import parameters
 
     fields = "\n".join(f"  {p['name']:<12} {p['doc']} (default: {json.dumps(p['default'])})" for p in parameters())
@@ -47,21 +48,21 @@ def _selfplay(options: argparse.Namespace) -> int:
 
 
 def _print_report(report: dict[str, Any]) -> None:
-    guards = list(dict.fromkeys(row["defender"] for row in report["table"]))
+    defenders = list(dict.fromkeys(row["defender"] for row in report["table"]))
     fixed = ", ".join(f"{name}={value:g}" for name, value in report["fixed"].items() if name != "setting")
     title = f"{report['episodes']} fresh episodes on {report['scenario']}: collisions [95 % interval], cost of care"
     rows = []
     for name in dict.fromkeys(row["attack"] for row in report["table"]):
         cells = [row for row in report["table"] if row["attack"] == name]
         rows.append((name, *(f"{_share(row['collisions'])}, {row['cost']:.3f}" for row in cells)))
-    table(("attack", *guards), rows, title, f"best fixed setting: {fixed}")
-    for guard, gain in report["exploitability"].items():
+    table(("attack", *defenders), rows, title, f"best fixed setting: {fixed}")
+    for defender, gain in report["exploitability"].items():
         found = gain["fresh"]["collisions"]
         weak = f"; the search was too weak: its fresh attacker does {_share(found)}, less than known ones" if gain["weak_search"] else ""
         told = f"{gain['attack']} less self-play's last attacker"
-        say(f"exploitability, {guard}: at least {_points(gain)} ({told}){weak}")
-    for guard, most in report["worst"].items():
-        say(f"worst known attack, {guard}: {_share(most['collisions'])} by {most['attack']}")
+        say(f"exploitability, {defender}: at least {_points(gain)} ({told}){weak}")
+    for defender, most in report["worst"].items():
+        say(f"worst known attack, {defender}: {_share(most['collisions'])} by {most['attack']}")
     say(f"worst known attacks, fixed less trained: {_points(report['worst_fixed_minus_trained'])}")
 
 

@@ -8,7 +8,7 @@ import secrets
 import sys
 from collections.abc import Callable, Container, Iterable, Sequence
 from contextlib import AbstractContextManager
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 from rich.console import Console
 from rich.markup import escape
@@ -18,6 +18,7 @@ from tailgate.base.errors import InputError
 from tailgate.base.progress import Update, console, progress
 from tailgate.core.schema import scalar
 
+T = TypeVar("T")
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # that a command is added to
 SHOWN = 20  # lines of one kind that are listed, at most
 MORE = "; --json lists them all"
@@ -99,7 +100,7 @@ def print_json(data: object) -> None:
     print(json.dumps(data, indent=1, allow_nan=False))
 
 
-def show(options: argparse.Namespace, data: Any, tables: Callable[[Any], None]) -> None:
+def show(options: argparse.Namespace, data: T, tables: Callable[[T], None]) -> None:
     """Print data as JSON with --json, else as tables."""
     (print_json if options.json else tables)(data)
 

@@ -10,9 +10,10 @@ from tailgate.core.schema import build
 
 
 def add(actions: Commands) -> None:
+    """Add `submit` to the actions of a command."""
     command = actions.add_parser(
-        "submit", help="play a stranger's defence in processes of its own and write one row per episode",
-        description="Play one class on a suite: in a process of its own, under limits, its rows mixed in secret with those of other "
+        "submit", help="play a stranger's defence in separate processes and write one row per episode",
+        description="Play one class on a suite: in a separate process, under limits, its rows mixed in secret with those of other "
         "attacks. This guards against accidents and greed; for code that you do not trust give --sandbox (see SECURITY.md).",
     )  # fmt: skip
     command.add_argument("defence", metavar="module:Class", help="class to play, module:Class:key=value, or the name of an entry point")
@@ -39,7 +40,7 @@ def _submit(options: argparse.Namespace) -> int:
     own_classes()
     if options.digest:
         with staged(options.defence) as source:
-            print(source.digest or f"{source.text} is built in: its version stands for it")
+            print(source.digest or f"{source.text} is built in: its version identifies it")
         return 0
     changes = values("--limit", options.limit, ", for example memory=1e9")
     limits = build(Limits, dataclasses.asdict(Limits()) | changes, "limit")

@@ -13,6 +13,7 @@ from tailgate.cli.shared import Commands, add_options, counted, own_classes, say
 
 
 def add(commands: Commands) -> None:
+    """Add `timing` to the commands."""
     command = commands.add_parser(
         "timing", help="timing advantage of trained policies: their own times against those of another episode",
         description="Play policies at their own times and at those of their twins: yoked (the times of another episode of the policy), "

@@ -13,6 +13,7 @@ MANY = 8  # defences, above which each has its line, without intervals
 
 
 def add(commands: Commands) -> None:
+    """Add `transfer` to the commands."""
     command = commands.add_parser(
         "transfer", help="the matrix trained on x played on of trained policies",
         description="Play policies against defences that they were not trained on. Scenario and threat model are those of the training "

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 
 def add(commands: Commands) -> None:
+    """Add `trust` to the commands."""
     command = commands.add_parser(
         "trust", help="how surely a defence keeps to temporal properties: statistical model checking",
         description="Play a suite, or the part of it that the options name, and decide temporal properties of every run. Of each defence a "

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 
 def add(commands: Commands) -> None:
+    """Add `tune` to the commands."""
     command = commands.add_parser(
         "tune", help="search a learner's hyper-parameters (needs tailgate[tune])",
         description="Train one policy per trial and keep the values whose policy does most damage on `tune` seeds. The same command goes "

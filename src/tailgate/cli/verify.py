@@ -20,7 +20,7 @@ def add(actions: Commands) -> None:
         "played.",
     )  # fmt: skip
     command.add_argument("--rows", nargs="+", required=True, metavar="FILE", help="JSON Lines files of `tailgate evaluate`")
-    command.add_argument("--sample", type=int, metavar="N", help="so many rows, drawn at random (default: all)")
+    command.add_argument("--sample", type=int, metavar="N", help="verify N rows, drawn at random (default: all)")
     add_options(command, "--sample-seed", "--workers")
     command.add_argument("--batch", type=int, metavar="N", help="episodes side by side instead of the rows' number; changes no result")
     command.add_argument("--trust-code", action="store_true", help="also import the classes that rows name; they run with your rights")

@@ -9,6 +9,7 @@ from tailgate.cli.shared import Commands, show, table
 
 
 def add(commands: Commands) -> None:
+    """Add `zoo` to the commands."""
     command = commands.add_parser("zoo", help="put trained policies into the package's zoo (`tailgate list zoo` shows it)")
     actions = command.add_subparsers(required=True, metavar="ACTION")
     more = actions.add_parser(

@@ -138,10 +138,12 @@ def _load(family: Family) -> dict[str, Entry]:
     if group and group not in _plugins_loaded:
         for point in entry_points(group=group):
             try:
-                put(entry_of(family, point.name, point.load()))
+                cls = point.load()
             except Exception as error:  # somebody's broken package shall not stop those who do not use it
                 warnings.warn(f"plug-in {point.name!r} of {group} cannot be loaded: {error}", stacklevel=2)
-        _plugins_loaded.add(group)
+                continue
+            put(entry_of(family, point.name, cls))
+        _plugins_loaded.add(group)  # only now: a name that is taken is an error each time
     return _entries[family]
 
 

@@ -19,6 +19,7 @@ def robust(suite: Suite) -> set[str]:
 
 
 def middle(suite: Suite) -> float:
+    """Return the middle one of the wanted mean times between false alarms [h]."""
     hours = sorted(suite.board.detection.hours) if suite.board.detection else [0.0]
     return hours[len(hours) // 2]
 

@@ -57,7 +57,7 @@ def build_site(
 
     replays: play each entry's worst episode again and write its page; without, the entries' pages say that it was not done.
     measured: the attachments of each board.
-    Raises InputError, before anything is written, for no board, two of a suite, one that is not of the format (names the field), and for
+    Raises InputError before anything is written: for no board, two of a suite, a field that breaks the format, and
     attachments of another suite.
     """
     suites = _suites(boards)

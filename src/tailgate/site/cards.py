@@ -1,7 +1,7 @@
 """Cards on the pages: the authors' words, over what is known of components that come with the package.
 
-A published board holds no copy of what registry and suite say: description, reference and uses, the file of the class, its licence, what
-attackers are granted, and what was trained.
+A published board holds no copy of facts from registry and suite. These are description, reference, uses, file and licence of a class, the
+threat model, and the trainings.
 """
 
 from __future__ import annotations

@@ -85,6 +85,7 @@ def spread(heights: Sequence[float], gap: float, ties: Sequence[float] = ()) -> 
 
 
 def shorten(text: str, most: int = LABEL) -> str:
+    """Return the text, at most `most` characters long, with an ellipsis where it is cut."""
     return text if len(text) <= most else text[: most - 1].rstrip() + "\N{HORIZONTAL ELLIPSIS}"
 
 

@@ -16,6 +16,7 @@ BLANK = {"text": figure(None), "span": "", "reason": "", "rarer": False}  # of a
 
 
 def dots_of(curve: Curve) -> Line:
+    """Return the points of a curve at doses that are numbers, in order, with the fit at each."""
     kept = [(p, i) for i, p in enumerate(curve.points) if p.dose is not None]
     kept.sort(key=lambda item: item[0].dose or 0)
     fitted = [curve.fitted[i] for _, i in kept] if curve.fitted else []

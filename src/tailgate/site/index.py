@@ -178,8 +178,8 @@ def comparisons_of(suite: Suite, defence: str | None = None) -> list[Data]:
 
 
 BOUND = (
-    " ≤ stands where the board does not know which episodes came to damage, but how many: the largest p that these numbers allow, and as "
-    "many episodes as can be; where a class has such pairs, at its corrected p too."
+    " ≤: the board knows how many episodes came to damage, but not which: the largest p that these numbers allow, and the largest number "
+    "of episodes. In a class with such pairs the corrected p has the mark too."
 )
 
 
@@ -218,10 +218,11 @@ def ranked_against(suite: Suite) -> str:
 
 
 def attacks_of(suite: Suite) -> list[Data]:
+    """Return the lines of a board's attacks, for the table of the first page."""
     own, out = suite_of(suite.board.suite.name, suite.board.suite.hash), []
     for attack in suite.board.attacks:
         late = own is not None and attack.attack not in own.attacks and not attack.attack.endswith(".json")
-        admitted = "met later, beside the suite" if late else "with the suite"
+        admitted = "met later, outside the suite" if late else "with the suite"
         admitted = admitted if attack.admitted is None else _admitted(attack.admitted)
         name = suite.attacks[attack.attack]
         on = suite.defences[attack.trained_on] if attack.trained_on else None
@@ -245,10 +246,10 @@ def _admitted(line: Data) -> str:
 def checked_of(suite: Suite) -> str:
     """Return how many entries' rows, and how many cells of the board alone, came out equal when played again; empty for none."""
     entries, said = suite.board.entries, []
-    if told := [entry.verified for entry in entries if entry.verified is not None]:
-        equal, differs, unchecked = sum(v.verified for v in told), sum(v.differs for v in told), sum(v.unchecked for v in told)
-        rows = played(max(sum(v.rows for v in told), suite.board.suite.rows or 0), equal, differs, unchecked, "rows")
-        said.append(f"rows of {sum(v.sound for v in told)} of {len(entries)} entries replayed without a difference: {rows}")
+    if checks := [entry.verified for entry in entries if entry.verified is not None]:
+        equal, differs, unchecked = sum(v.verified for v in checks), sum(v.differs for v in checks), sum(v.unchecked for v in checks)
+        rows = played(max(sum(v.rows for v in checks), suite.board.suite.rows or 0), equal, differs, unchecked, "rows")
+        said.append(f"rows of {sum(v.sound for v in checks)} of {len(entries)} entries replayed without a difference: {rows}")
     if held := [entry.checked for entry in entries if entry.checked is not None]:
         equal, differs, unchecked = sum(c.equal for c in held), sum(c.differs for c in held), sum(c.unchecked for c in held)
         cells = played(len(suite.board.cells), equal, differs, unchecked, "cells")

@@ -24,6 +24,7 @@ def figure(value: float | None, digits: int = 4) -> str:
 
 
 def dose_text(dose: Dose) -> str:
+    """Return a dose as text; None is the budget of the scenario."""
     return "the scenario's own" if dose is None else str(dose)
 
 
@@ -150,6 +151,7 @@ def share_of(share: Limited | float | None) -> Data:
 
 
 def gates_of(entry: Entry) -> Data:
+    """Return how many gates an entry passes, which ones it fails, and a value to sort by."""
     failed = [g for g in entry.gates if not g.passed]
     names = ", ".join(dict.fromkeys(g.gate.replace("_", " ") for g in failed))
     if not entry.gates:

@@ -13,7 +13,7 @@ TIMES = (  # as the twins of tailgate.studies.timing
 )  # fmt: skip
 VERDICTS = {
     "more": "At its own times it surely does more", "equal": "At its own times it surely does hardly more",
-    "unknown": "Whether it does more at its own times cannot be told",
+    "unknown": "It is undecided if it does more at its own times",
 }  # fmt: skip
 
 

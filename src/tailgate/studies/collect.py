@@ -21,7 +21,7 @@ from tailgate.core.registry import Spec
 from tailgate.core.schema import as_data
 from tailgate.play.metrics import METRICS, unit_in
 
-from .policies import defence_of, loop_for, mean, outcome_for, place_of, trained
+from .policies import defence_of, loop_for, mean, outcome_for, scenario_of, trained
 from .timing import played
 
 POINTS = 50  # of a learning curve, at most
@@ -51,8 +51,8 @@ def packed(file: Path) -> bytes:
 def add_policy(policy: Path, name: str, summary: str, *, episodes: int = EPISODES, replace: bool = False, folder: Path = FOLDER) -> Path:
     """Copy a trained policy into the zoo as `name`; returns its JSON file. Its outcome is measured again, on report seeds.
 
-    Raises InputError for a policy without a record of its training, for one that is too large, and, without `replace`, for a name
-    that is taken.
+    Raises InputError for a policy without a record of its training, and for one that is too large. Without `replace` it raises one too
+    for a name that is taken.
     """
     if not _NAME.fullmatch(name) or name.endswith((".json", ".safetensors")):
         raise InputError("zoo.name", name, "letters, digits, '-', '_' and '.', and no separator")
@@ -63,7 +63,7 @@ def add_policy(policy: Path, name: str, summary: str, *, episodes: int = EPISODE
         raise InputError("zoo.name", name, "a name that is not taken, or --replace")
     who = trained(str(policy))
     header = who.header
-    scenario, record = place_of(who), header.training
+    scenario, record = scenario_of(who), header.training
     curve = record.get("curve", [])
     if not isinstance(curve, list) or not all(isinstance(point, dict) for point in curve):
         raise InputError(f"policy {who.name}.training.curve", curve, "a list of points, a mapping each")

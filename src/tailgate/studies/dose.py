@@ -2,7 +2,7 @@
 
 The curve is a monotone (isotonic) regression of the measured means, as a larger budget can be left unspent. The critical dose is where the
 curve, straight between two measured doses, first exceeds the limit. Its interval is a percentile bootstrap over episodes, the same for
-every dose: it says nothing of how the curve runs between two doses that lie far apart.
+every dose. It does not cover the course of the curve between two doses that lie far apart.
 """
 
 from __future__ import annotations
@@ -101,11 +101,11 @@ def dose_response(
             played = [held[defence, "none", 0], *(held[defence, attack, dose] for dose in steps)]
             curves.append(_curve(attack, defence, played, [0, *steps], counted, exceeds, limit))
     curves += [{"attack": attack, "defence": defence, "skipped": why} for defence in against for attack, why in reasons.items() if why]
-    place = load_scenario(scenario).with_threat(**threat)
+    loaded = load_scenario(scenario).with_threat(**threat)
     return {
         "measure": "dose-response", "scenario": scenario, "purpose": purpose, "episodes": episodes, "outcome": counted,
-        "unit": "0/1" if share else unit_in(counted, place.brief().model), "exceeds": exceeds, "limit": limit, "doses": [0, *steps],
-        "threat": as_data(threat), "threat_model": as_data(place.threat_model), "curves": curves,
+        "unit": "0/1" if share else unit_in(counted, loaded.brief().model), "exceeds": exceeds, "limit": limit, "doses": [0, *steps],
+        "threat": as_data(threat), "threat_model": as_data(loaded.threat_model), "curves": curves,
     }  # fmt: skip
 
 

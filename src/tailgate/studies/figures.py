@@ -103,7 +103,8 @@ def dose_figure(report: dict[str, Any]) -> bytes:
 def transfer_figure(report: dict[str, Any]) -> bytes:
     """Draw the mean outcome of what was trained on (rows, below a row without an attack) and played on (columns).
 
-    Frames: both are the same; stars: flagged. Shades are of the logarithm where the outcome is no share."""
+    Frames: both are the same; stars: flagged. Shades are of the logarithm where the outcome is no share.
+    """
     rows, columns, share = ["(no attack)", *report["trained_on"]], report["played_on"], report["unit"] == "0/1"
     grid = np.full((len(rows), len(columns)), np.nan)
     grid[0] = [report["no_attack"].get(column, np.nan) for column in columns]

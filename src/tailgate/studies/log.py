@@ -1,8 +1,8 @@
 """Logs: clean and attacked episodes as Parquet, for those who learn a detector.
 
 One row per step and agent. Training episodes have seeds of the purpose `train` and development episodes of `tune`: neither ever meets the
-seeds of a board. The attacks that a suite holds out are not in its logs, so that a board also shows what a detector makes of attacks that
-it has never seen. Each cell is a separate part until all are done, so that an interrupted log goes on; the same log has the same bytes.
+seeds of a board. The attacks that a suite holds out are not in its logs: a board also shows how a detector handles unseen attacks. Each
+cell is a separate part until all are done, so that an interrupted log goes on; the same log has the same bytes.
 """
 
 from __future__ import annotations
@@ -164,10 +164,11 @@ def _written(
         "attacks": list(chosen.attacks), "defences": list(chosen.defences), "doses": list(chosen.doses), "files": files, "skipped": skipped,
         "scenarios": {
             name: {
-                "about": place.about, "config_hash": place.config_hash, "dt": model.dt, "horizon": place.horizon, "agents": model.agents,
+                "about": scenario.about, "config_hash": scenario.config_hash, "dt": model.dt,
+                "horizon": scenario.horizon, "agents": model.agents,
                 "columns": [column._asdict() for column in described],
             }
-            for name, (place, model, described) in columns.items()
+            for name, (scenario, model, described) in columns.items()
         },
     }  # fmt: skip
     write_atomic(folder / "README.md", readme(held).encode())
@@ -222,7 +223,7 @@ def _play_part(part: Path, split: str, cell: Cell, loop: Loop, attack: Attack, c
             writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=count)
 
 
-def _array(pa: ModuleType, field: Any, value: Any, count: int) -> Any:
+def _array(pa: ModuleType, field: Any, value: str | Array, count: int) -> Any:
     if not isinstance(value, np.ndarray):
         return pa.array([value] * count, field.type)
     return pa.array(value, field.type, mask=np.isnan(value) if field.nullable else None)
@@ -232,7 +233,7 @@ def steps(loop: Loop, attack: Attack, keys: draws.Keys) -> Iterator[tuple[LoopSt
     """Yield each step of B episodes: the state before it, its frame, the innovation (B, N, q), NaN if none, and live (B,) bool."""
     state = loop.start(keys)
     plan = attack.prepare(loop.brief)
-    memory: Any = attack.start(plan, len(keys.key), keys.at(Role.ATTACK, np.zeros(len(keys.key), np.int64)))
+    memory = attack.start(plan, len(keys.key), keys.at(Role.ATTACK, np.zeros(len(keys.key), np.int64)))
     while int(state.k[0]) <= loop.horizon and not state.ended.all():
         live, before = ~state.ended, duplicate(state.defence)
         held = state._replace(defence=before)

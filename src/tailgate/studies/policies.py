@@ -119,9 +119,9 @@ def origin_of(text: str) -> dict[str, Any] | None:
 
 
 def rising(curve: object) -> bool:
-    """Return whether a learning curve still rose when training ended.
+    """Return if a learning curve still rose when training ended.
 
-    The line through its last quarter rises by more than two standard errors of its slope, and by over a twentieth of all that was learned.
+    The slope of the line through its last quarter exceeds two standard errors, and its rise a twentieth of all that was learned.
     """
     rewards = [point.get("reward") for point in curve if isinstance(point, dict)] if isinstance(curve, list) else []
     y = np.array([x for x in rewards if isinstance(x, int | float)], np.float64)
@@ -151,7 +151,7 @@ def _text(value: object) -> str | None:
     return value if isinstance(value, str) else None
 
 
-def place_of(who: Trained, named: str | None = None) -> str:
+def scenario_of(who: Trained, named: str | None = None) -> str:
     """Return the scenario that the user names, or else that of the training: a registered one, as a record shall not choose a file."""
     if named:
         return named
@@ -186,9 +186,9 @@ def check_episodes(episodes: int) -> None:
 
 def loop_for(who: Trained, scenario: str, defence: str, threat: dict[str, Any], dose: int | None = None) -> Loop:
     """Return the loop that a policy is played in, with the knowledge that it was trained with."""
-    place = Cell("", scenario, dose, defence, who.text, 1, threat=threat).place(who.policy, who.header.knowledge)
+    cell = Cell("", scenario, dose, defence, who.text, 1, threat=threat)
     spec = Spec("defence", defence)
-    loop = place.loop(spec.make(), spec.entry.uses)
+    loop = cell.place(who.policy, who.header.knowledge).loop(spec.make(), spec.entry.uses)
     who.policy.prepare(loop.brief)  # refuses a policy of another layout here
     return loop
 

@@ -16,7 +16,7 @@ from tailgate.evaluation.checks import Finding, again
 from tailgate.training import train
 
 from .collect import packed
-from .policies import Trained, place_of, trained
+from .policies import Trained, scenario_of, trained
 
 Verdict = Literal["same", "differs", "unchecked"]
 
@@ -35,9 +35,9 @@ class Again(NamedTuple):
 def retrain(text: str, progress: Callable[[train.TrainConfig, Progress], None] | None = None) -> Again:
     """Train the policy of a JSON file, or of the zoo (`zoo:name=NAME`), once more with its configuration and seed, in a temporary folder.
 
-    A record is read and never run: one that names code to import, a scenario that is not built in, or a defence of other files or of
-    another version than here cannot be checked, and the reason is returned. Weights are the same to the last bit on one machine type
-    with the versions of constraints.txt; PPO and what else rests on torch may differ elsewhere, and `why` names what is another here.
+    A record is read and never run. It cannot be checked if it names code to import, a scenario that is not built in, or another version
+    of a defence. The reason is then returned. Weights are the same to the last bit on one machine type with the versions
+    of constraints.txt. PPO and others that use torch may differ elsewhere, and `why` names the differences.
     """
     def play(jobs: Mapping[str, tuple[Trained, train.TrainConfig]]) -> Iterator[tuple[str, Again]]:
         for name, (who, config) in jobs.items():
@@ -91,7 +91,7 @@ def _config(who: Trained) -> train.TrainConfig:
     held = record.get("config")
     if not isinstance(held, dict) or who.seed is None:
         raise InputError(where, record.get("seed"), "the configuration and the seed of a training")
-    place_of(who)
+    scenario_of(who)
     config = train.checked({key: value for key, value in held.items() if key != "class"})
     spec = Spec("defence", config.defence)
     recorded = str(record.get("defence_digest", "")), record.get("defence_version", 1)

@@ -3,8 +3,8 @@
     timing advantage = P(damage | own schedule) - P(damage | yoked schedule)
 
 Yoked: the steps at which another episode of the same policy attacked, recorded with termination off; values are still chosen in its own
-state. Two more twins show what it gains by attacking in bursts, which is not timing: shuffled, as many steps of the episode at random
-times that the threat model allows, and periodic, as many evenly spread.
+state. Two more twins show the gain of attacking in bursts, which is not timing. Shuffled: as many steps of the episode at random times that
+the threat model allows. Periodic: as many, evenly spread.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from tailgate.evaluation.stats import Interval, paired_difference
 from tailgate.play.metrics import METRICS, attack_steps, unit_in
 from tailgate.play.trace import Trace, episodes_at_once, rollout
 
-from .policies import BATCH, Trained, defence_of, distinct, is_share, loop_for, mean, outcome_for, place_of
+from .policies import BATCH, Trained, defence_of, distinct, is_share, loop_for, mean, outcome_for, scenario_of
 
 TWINS = {  # each schedule, and what it is
     "own": "when the policy attacks",
@@ -130,7 +130,7 @@ def timing(
         raise InputError("episodes", episodes, "at least 2: the schedule of another episode is needed")
     groups: dict[str, list[tuple[Trained, Loop, dict[str, Any]]]] = {}
     for who in distinct(texts):
-        where, against = place_of(who, scenario), defence_of(who, defence)
+        where, against = scenario_of(who, scenario), defence_of(who, defence)
         changed = who.threat | dict(threat or {})
         counted = outcome_for(outcome or who.outcome, where)
         loop = loop_for(who, where, against, changed, dose)

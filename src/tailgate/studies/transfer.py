@@ -24,7 +24,7 @@ from tailgate.evaluation.cells import Cell, cells_of, run
 from tailgate.evaluation.stats import Interval, paired_difference
 from tailgate.play.metrics import unit_in
 
-from .policies import Trained, check_episodes, defence_of, distinct, is_share, mean, misfit, outcome_for, place_of
+from .policies import Trained, check_episodes, defence_of, distinct, is_share, mean, misfit, outcome_for, scenario_of
 
 LEVEL = 0.95
 T = TypeVar("T")
@@ -55,9 +55,9 @@ def transfer(
 ) -> dict[str, Any]:  # fmt: skip
     """Play, and return the report. Without `defences` the policies are played on those that they were trained on.
 
-    The word `all` means these and every registered defence that has a meaning in the scenario: those that a suite plays there, or,
-    where no suite goes, those that it admits; sentinels and what plays one episode after the other have to be named. `skipped` says who
-    is left out, and why.
+    The word `all` adds every registered defence that has a meaning in the scenario. These are the defences of the suites with it; if none
+    has it, those that the scenario admits. Sentinels, and defences that play one episode after the other, have to be named. `skipped` lists
+    who is left out, with the reason.
 
     Scenario and threat model are those of the training, which have to agree where nothing else is given. A policy that does not fit them
     (another observation or action) is skipped, with the reason.
@@ -66,7 +66,7 @@ def transfer(
     members = distinct(texts)
     if not members:
         raise InputError("policies", list(texts), "at least one")
-    where = scenario or _common("scenario", {who.name: place_of(who) for who in members})
+    where = scenario or _common("scenario", {who.name: scenario_of(who) for who in members})
     changed = _common("threat", {who.name: who.threat for who in members}) if threat is None else dict(threat)
     counted = outcome_for(outcome or next((who.outcome for who in members if who.outcome), None), where)
     origins = {who.text: defence_of(who) for who in members}
@@ -83,8 +83,8 @@ def transfer(
             skipped.append({"policy": who.name, "trained_on": origins[who.text], "reason": reason})
         else:
             good.append(who)
-    rivals = ("none", *(who.text for who in good))
-    cells = cells_of(Suite("transfer", "", (where,), (dose,), columns, rivals, episodes, changed), purpose=purpose)
+    attacks = ("none", *(who.text for who in good))
+    cells = cells_of(Suite("transfer", "", (where,), (dose,), columns, attacks, episodes, changed), purpose=purpose)
     rows = run(cells, rows_file, workers, progress)
     held: dict[tuple[str, str], Array] = {}
     for i, cell in enumerate(cells):
@@ -119,10 +119,10 @@ def transfer(
                 gain = difference(values, own, is_share(counted))
                 entry |= {"over_own": gain._asdict(), "flags": ["transferred beats own"] if gain.low > 0.0 else []}
             entries.append(entry)
-    place = load_scenario(where).with_threat(**(changed | ({} if dose is None else {"budget": dose})))
+    loaded = load_scenario(where).with_threat(**(changed | ({} if dose is None else {"budget": dose})))
     return {
         "measure": "transfer", "scenario": where, "purpose": purpose, "episodes": episodes, "outcome": counted,
-        "unit": unit_in(counted, place.brief().model), "threat_model": as_data(place.threat_model),
+        "unit": unit_in(counted, loaded.brief().model), "threat_model": as_data(loaded.threat_model),
         "trained_on": list(origin_rows), "played_on": list(columns),
         "no_attack": {column: float(held["none", column].mean()) for column in columns if ("none", column) in held},
         "entries": entries, "skipped": skipped,

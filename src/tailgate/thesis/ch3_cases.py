@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from tailgate.core import Array, Defence, Estimate, Model, Prior, Received
-from tailgate.core.draws import Draws, keys
+from tailgate.board.clock import Timed
+from tailgate.core import Array
+from tailgate.core.draws import keys
 from tailgate.core.registry import Spec, make
 from tailgate.core.scenario import load_scenario
 from tailgate.envs.controllers.radar_car import GAP
@@ -230,35 +230,16 @@ def _switches(seeds: int) -> tuple[Claim, Table]:
     return claim, Table("Scenario (ii): the later the leader changes its acceleration, the worse the prediction", heads, tuple(rows))
 
 
-class _Timed:
-    """A defence that adds up the time of its steps [s]."""
-
-    def __init__(self, inner: Defence) -> None:
-        self.inner, self.total = inner, 0.0
-
-    def prepare(self, model: Model) -> Any:
-        return self.inner.prepare(model)
-
-    def start(self, plan: Any, prior: Prior) -> Any:
-        return self.inner.start(plan, prior)
-
-    def step(self, plan: Any, state: Any, received: Received, known_u: Array, draws: Draws) -> tuple[Any, Estimate]:
-        begin = time.perf_counter()
-        out = self.inner.step(plan, state, received, known_u, draws)
-        self.total += time.perf_counter() - begin
-        return out
-
-
 def _run_time() -> Claim:
     spec, times = Spec("defence", OURS), {}
     for words, batch in (("one episode", 1), ("each of 1000 side by side", 1000)):
         fastest = np.inf
         for _ in range(3):
-            timed = _Timed(spec.make())
+            timed = Timed(spec.make())
             loop = load_scenario(SCENARIOS["i"]).loop(timed, spec.entry.uses)
             rollout(loop, Spec("attack", ATTACKS["DoS"]).make(), keys("report", range(batch)))
-            fastest = min(fastest, timed.total / batch)
-        times[words] = float(f"{1e9 * fastest:.2g}")
+            fastest = min(fastest, sum(timed.taken) / batch)
+        times[words] = float(f"{fastest:.2g}")
     return Claim(
         "3.5-run-time", "The algorithm runs in 1.2e7 ns under jamming, 1.3e7 ns under delay", "1.2e7 ns", {"300 steps [ns]": times},
         verdict(times["one episode"] < 1.2e7, times["each of 1000 side by side"] > 1.2e7),

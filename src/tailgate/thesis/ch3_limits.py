@@ -109,7 +109,10 @@ def _hopping(seeds: int) -> Claim:
 
 
 def _reaction(seeds: int) -> tuple[Claim, Table, Drawing]:
-    """Play attackers that fall silent a reaction time after the probe: are they heard by the challenge at 182 s, and what do they do?"""
+    """Play attackers that fall silent a reaction time after the probe.
+
+    The claim is about the challenge at 182 s: it hears them, and what they do.
+    """
     curve: dict[str, list[float]] = {"reaction": list(REACTIONS)}
     rows = []
     for reaction in REACTIONS:

@@ -263,7 +263,7 @@ def _list(names: list[str]) -> str:
 
 
 def _always_positive(runs: Runs) -> Iterator[Claim]:
-    """Ask of each run: is the distance that the controller is given positive wherever the true one is?"""
+    """Yield claims on each run: the distance that the controller is given is positive wherever the true one is."""
     for case in HARMFUL:
         shares = {}
         for r in READINGS:

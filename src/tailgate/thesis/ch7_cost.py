@@ -20,6 +20,8 @@ RUNS, WITHIN, REPEATS = 50, 30.0, 3
 
 
 class Cost(NamedTuple):
+    """The price of a simulated run."""
+
     moves: float  # of a run, mean
     rate: float  # runs per second of one processor
 

@@ -1,4 +1,4 @@
-"""The case study in the loop: a lidar that is made to see the car ahead farther away, the monitor of safe states, and the brake."""
+"""The case study in the loop: a lidar under attack, which sees the car ahead farther away, the monitor of safe states, and the brake."""
 
 from __future__ import annotations
 

@@ -33,8 +33,8 @@ def interval(i: Interval) -> dict[str, float]:
 def judge(cells: Sequence[Interval], level: float, floor: float = 0.5) -> tuple[Holds, str]:
     """Return the verdict on shares that have to reach a level, and what to add to `why` where an interval does not decide it.
 
-    A share that reaches the level counts for the claim even if its interval goes below, so that neither the number of runs nor one failure
-    decides; one whose whole interval is below `floor` against it.
+    A share that reaches the level counts for the claim even if its interval goes below. So neither the number of runs nor one failure
+    decides. A share whose whole interval is below `floor` counts against the claim.
     """
     holds = verdict(all(i.value >= level for i in cells), all(i.high < floor for i in cells))
     open_ = sorted({bound for i in cells for bound in (level, floor) if i.low < bound <= i.high})

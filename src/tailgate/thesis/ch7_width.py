@@ -27,6 +27,8 @@ RARE = 0.05  # share of runs with a false alarm that is none to speak of
 
 
 class Heard(NamedTuple):
+    """The alarms of a monitor, without an attack and under one."""
+
     false: Interval  # runs with an alarm without an attack
     after: float  # median time from the first attacked step to an alarm [s]; inf for never
 

@@ -93,9 +93,12 @@ def weighted_error(model: Model, error: Array, fusion: Fusion | None = None) -> 
 def norm_basin(model: Model, lam: float, fusion: Fusion | None = None) -> Array:
     """Return (N,) lam / |Sv_i^-1/2 C_i P_i^1/2|_2; infinite for a blind agent.
 
-    Without attack and noise (5.8) converges where the largest `weighted_error` before the first prediction is at most the least of these:
-    then { x' P_i^-1 x <= max_j e_j' P_j^-1 e_j } lies in { |Sv_i^-1/2 C_i x|_2 <= lam } for every agent i. Erratum: Theorem 5.3.3 has
-    2 lam, for which one state with a = 1.5, c = 0.1 diverges, and lets each agent answer for its own error only.
+    Without attack and noise (5.8) converges if the largest `weighted_error` before the first prediction is at most the least of these.
+    Then for every agent i
+
+        { x' P_i^-1 x <= max_j e_j' P_j^-1 e_j }  lies in  { |Sv_i^-1/2 C_i x|_2 <= lam }
+
+    Erratum: Theorem 5.3.3 has 2 lam, for which one state with a = 1.5, c = 0.1 diverges, and bounds each agent by its own error only.
     """
     fusion = fusion or fixed_point(model)
     size = np.linalg.norm(_white(model) @ np.linalg.cholesky(fusion.P), 2, axis=(1, 2))

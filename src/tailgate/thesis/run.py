@@ -35,11 +35,13 @@ def reproduce(chapter: str, seeds: int = 200, tick: Callable[[str], None] = lamb
 
 
 def check_chapter(chapter: str) -> None:
+    """Raise InputError for a chapter that does not exist."""
     if chapter not in CHAPTERS:
         raise unknown("chapter", chapter, CHAPTERS)
 
 
 def check_seeds(seeds: int) -> None:
+    """Raise InputError for too few seeds, and for more than the memory holds."""
     if seeds < 10:
         raise InputError("seeds", seeds, "a whole number not below 10")
     sizes.check("seeds", seeds)

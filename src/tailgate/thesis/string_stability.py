@@ -1,9 +1,9 @@
-"""String stability of a platoon: does a disturbance of the leader's speed grow along the string (1.18)?
+"""String stability (1.18) of a platoon: a disturbance of the leader's speed does not grow along the string.
 
     |V_i(jw) / V_0(jw)| <= 1 for every frequency w and every car i
 
-`transfer` and `peak` compute with the public model of the closed loop in continuous time, `sweep` measures in the loop of a scenario, with
-its sensors, its limits, a defence and an attack. These are formulas for a reader and for tests, not part of the scored path.
+`transfer` and `peak` compute with the public model of the closed loop in continuous time. `sweep` measures in the loop of a scenario, with
+its sensors, its limits, a defence and an attack. These formulas are for readers and tests; they are not part of the scored path.
 
     python -m tailgate.thesis.string_stability --out docs/images/string-stability.png
 """
@@ -186,6 +186,7 @@ def figure() -> bytes:
 
 
 def main() -> None:
+    """Write the picture of the gains over frequency."""
     parser = argparse.ArgumentParser(description="Writes the picture of the gains over frequency.")
     parser.add_argument("--out", type=Path, default=Path("docs/images/string-stability.png"))
     write_atomic(parser.parse_args().out, figure())

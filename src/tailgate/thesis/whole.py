@@ -128,6 +128,7 @@ def facts(whole: Whole) -> dict[str, str]:
 
 
 def covered(items: list[Item]) -> str:
+    """Return how many numbered items of the thesis claims answer."""
     with_claims = sum(bool(item.claims) for item in items)
     return f"{len(items)} items: {with_claims} are answered by claims, {len(items) - with_claims} state no result"
 

@@ -1,8 +1,8 @@
-"""Attackers trained against one defence, as a suite says: what a defence has to stand before a board ranks it.
+"""Attackers trained against one defence, as a suite says: a board ranks a defence after it has met them.
 
-An attack that was made for another defence says little: most published defences fell to the first attack that knew them (Tramèr et al.,
-On Adaptive Attacks to Adversarial Example Defenses, NeurIPS 2020). So every learner that the suite names is trained on the defence itself,
-at the suite's dose and within its threat model, black and grey box, and its policies join the attacks of that defence's rows.
+An attack that was made for another defence says little: most published defences fell to the first attack that knew them. (Tramèr et al.,
+On Adaptive Attacks to Adversarial Example Defenses, NeurIPS 2020.) So every learner that the suite names is trained on the defence itself.
+It has the suite's dose and threat model, black and grey box. Its policies join the attacks of that defence's rows.
 """
 
 from __future__ import annotations
@@ -74,13 +74,13 @@ def configs_of(suite: Suite, defence: str, out: Path, *, seeds: int | None = Non
     settings = [f"defence={json.dumps(defence)}", f"out={json.dumps(str(out))}", "tensorboard=false"]
     settings += ["others=[]", "white_box=[]", f"seeds={seeds or plan.seeds}"]
     found = []
-    for place in plan.scenarios or suite.scenarios[:1]:
-        tag = f"-{place}" if len(plan.scenarios) > 1 else ""
+    for scenario in plan.scenarios or suite.scenarios[:1]:
+        tag = f"-{scenario}" if len(plan.scenarios) > 1 else ""
         for learner, changes in plan.learners.items():
             for knowledge in plan.knowledge:
                 name = f"{stem(defence)}-{learner}-{knowledge}{tag}"
                 granted = f"threat={json.dumps(threat | {'knowledge': knowledge})}"
-                own = [f"name={name}", f"learner={learner}", f"scenario={place}", *settings, granted, *plan.changes, *changes, *extra]
+                own = [f"name={name}", f"learner={learner}", f"scenario={scenario}", *settings, granted, *plan.changes, *changes, *extra]
                 found.append(train.load_config(plan.config, own))
     return found
 

@@ -128,12 +128,12 @@ def _report(
     versus = {"no attack": difference(none), "own yoked schedule": difference(yoked)}
     if best is not None:
         versus["best scripted attack"] = over(best)
-    place, heads = load_scenario(config.scenario).with_threat(**config.threat), [load_policy(v.policy)[0] for v in verdicts]
+    scenario, heads = load_scenario(config.scenario).with_threat(**config.threat), [load_policy(v.policy)[0] for v in verdicts]
     report = {
         "name": config.name, "scenario": config.scenario, "defence": config.defence, "episodes": config.episodes, "steps": config.steps,
-        "outcome": outcome, "unit": unit_in(outcome, place.brief().model), "learner": config.learner,
+        "outcome": outcome, "unit": unit_in(outcome, scenario.brief().model), "learner": config.learner,
         "teacher": heads[0].training.get("teacher"), "decisions": [head.training["steps"] for head in heads],
-        "threat": as_data(place.threat_model),
+        "threat": as_data(scenario.threat_model),
         "config": json.loads(canonical(config)), "policies": [str(v.policy) for v in verdicts], "best_scripted": best,
         "made_of": scripts.made_of,
         "attacks": [{"label": label, **interval._asdict(), "note": note} for label, interval, note in items],

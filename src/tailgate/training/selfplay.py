@@ -1,14 +1,15 @@
 """Self-play: attacker and defender train in turns against growing pools; then a fresh attacker measures what the defender is worth.
 
-Round r trains attacker r against the uniform mixture of defenders 0 to r - 1, then defender r against the uniform mixture of attackers 1
-to r; defender 0 is the defence with its knobs at the menu's setting nearest to its own values. At the end the last defender is frozen,
-and an attacker with new seeds and the same budget is trained against it: the best response. The same is done for the best fixed setting.
+Round r trains attacker r against the uniform mixture of defenders 0 to r - 1. Then it trains defender r against the uniform mixture of
+attackers 1 to r. Defender 0 is the defence with its knobs at the menu's setting nearest to its own values. At the end the last defender is
+frozen, and an attacker with new seeds and the same budget is trained against it: the best response. The same is done for the best fixed
+setting.
 
     exploitability = collisions under the worst known attack - collisions under the last attacker of self-play
 
-Known are scripts, pool and fresh attackers; the worst is chosen on select seeds and reported on report seeds, for the trained defender and
-for the best fixed setting. The best answer there is does at least as much. Where the fresh attacker does less than what was known without
-it the search was too weak to say how much more, and the report says so.
+The known attacks are scripts, pool and fresh attackers. The worst is chosen on select seeds and reported on report seeds, for the trained
+defender and for the best fixed setting. The best answer there is does at least as much. If the fresh attacker does less than the other
+known attacks, the search was too weak: the report says so.
 
 A member is trained for certain opponents: a run that goes on trains again what was trained for others.
 """
@@ -16,11 +17,10 @@ A member is trained for certain opponents: a run that goes on trains again what 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import itertools
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -162,19 +162,15 @@ class Game:
     def _run(self) -> dict[str, Any]:
         defenders, attackers = [self._as_it_is()], []
         for r in range(1, self.config.rounds + 1):
-            pool = self._defence(policy=tuple(defenders))
+            pool = replace(self.duel.guard, policy=tuple(defenders))
             attackers.append(self._attacker(f"attacker-{r}", self.config.first_seed + r, pool))
             defenders.append(self._defender(r, tuple(PolicyAttack(path) for path in attackers)))
-        frozen = self._defence(policy=defenders[-1])
+        frozen = replace(self.duel.guard, policy=defenders[-1])
         setting = self._best_setting(tuple(PolicyAttack(path) for path in attackers))
-        fixed = self._defence(setting=setting)
+        fixed = replace(self.duel.guard, setting=setting)
         fresh = [self._fresh(f"fresh-{i}", i, frozen) for i in range(self.config.fresh)]
         other = [self._fresh(f"fresh-fixed-{i}", i, fixed) for i in range(self.config.fresh)]
-        return self._report({AS_IS: self._defence(), FIXED: fixed, TRAINED: frozen}, attackers, fresh, other, setting)
-
-    def _defence(self, **who: Any) -> Steered:
-        """Return the defence in certain hands: a policy's, or those of a fixed setting."""
-        return dataclasses.replace(self.duel.guard, **who)
+        return self._report({AS_IS: self.duel.guard, FIXED: fixed, TRAINED: frozen}, attackers, fresh, other, setting)
 
     def _as_it_is(self) -> Path:
         path, setting = self.directory / "defender-0", nearest(self.duel.guard.hand.knobs)
@@ -237,8 +233,8 @@ class Game:
 
     def _play(self, defence: Steered, attack: Attack, purpose: str, episodes: int) -> Played:
         """Play the first episodes of a pair on seeds of a purpose."""
-        seat = dataclasses.replace(self.duel.seat, loop=dataclasses.replace(self.duel.seat.loop, defence=defence))
-        duel = dataclasses.replace(self.duel, seat=seat, guard=defence)
+        seat = replace(self.duel.seat, loop=replace(self.duel.seat.loop, defence=defence))
+        duel = replace(self.duel, seat=seat, guard=defence)
         parts = [play(duel, attack, draws.keys(purpose, range(at, min(at + BATCH, episodes)))) for at in range(0, episodes, BATCH)]
         paid, crashed, cost = (np.concatenate([getattr(part, name) for part in parts]) for name in ("paid", "crashed", "cost"))
         return Played(paid, crashed, cost, sum(part.decisions for part in parts))

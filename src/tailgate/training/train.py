@@ -74,7 +74,7 @@ class TrainConfig:
     select_episodes: Episodes = param(1024, "other episodes, that the best rival is chosen on: fewer choose by chance")
     workers: Workers = param(2, "processes, of the training seeds and of the comparison; change no result")
     rivals: tuple[str, ...] = param((), "scripted attacks of equal knowledge and dose to compare with")
-    white_box: tuple[str, ...] = param(("stealth:trigger=near,threshold=40",), "attacks that know more, shown beside the others")
+    white_box: tuple[str, ...] = param(("stealth:trigger=near,threshold=40",), "attacks that know more, shown next to the others")
     others: tuple[str, ...] = param(("none", "kf", "oracle"), "further defences that the attacks are played on")
 
     @property
@@ -136,7 +136,7 @@ def checked(data: dict[str, Any]) -> TrainConfig:
 def environment_of(config: TrainConfig) -> dict[str, Any]:
     """Return arguments of the adversary environment."""
     for key in config.environment:
-        if key not in ENVIRONMENT:  # the scenario, the defence, the threat model and gamma have a field of their own
+        if key not in ENVIRONMENT:  # the scenario, the defence, the threat model and gamma have other fields
             raise unknown("config.environment: unknown field", key, ENVIRONMENT)
     return {"scenario": config.scenario, "defence": config.defence, "threat": dict(config.threat), **config.environment}
 
@@ -162,9 +162,9 @@ def check(config: TrainConfig) -> None:
     cells_of(suite_of(config, (*config.rivals, *config.white_box)), threat=config.threat)
 
 
-def _check_memory(config: TrainConfig, settings: Any, seat: Seat) -> None:
+def _check_memory(config: TrainConfig, settings: Config, seat: Seat) -> None:
     """Raise InputError where the environments side by side, and the decisions that a learner keeps, take more memory than is free."""
-    rows = settings.envs if hasattr(settings, "envs") else settings.population * settings.episodes
+    rows = getattr(settings, "envs", 0) or getattr(settings, "population", 0) * getattr(settings, "episodes", 0)
     kept = max(rows * getattr(settings, "rollout", 0), getattr(settings, "buffer_size", 0))
     side_by_side, seen = min(config.workers, config.seeds), 16 * len(seat.observation.names)  # bytes: before and after, and half for copies
     needed = side_by_side * (rows * seat.memory + kept * (seen + 64))

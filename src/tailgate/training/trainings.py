@@ -49,7 +49,7 @@ Report = Callable[[Training, Progress], None]
 
 
 def train_all(trainings: Sequence[Training], begin: Callable[[Training], None], progress: Report, workers: int) -> list[Path]:
-    """Train, and return JSON files of the policies, in the order of the trainings, as many of which run at a time as there are workers.
+    """Train in as many processes as there are workers, and return JSON files of the policies in the order of the trainings.
 
     begin: called with each, before anything of it is done. Where one fails, those that have begun end, no other begins, and the error
     names it.

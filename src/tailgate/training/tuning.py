@@ -1,8 +1,8 @@
 """Search for hyper-parameters of a learner with Optuna (Akiba et al. 2019; extra: tune).
 
-A trial trains one policy with the values that the sampler proposes, and its objective is the policy's mean outcome on fresh episodes of
-the purpose `tune`: never those that are reported. Trials are kept as a journal of JSON lines, so that the same command goes on where an
-interrupted one stopped; a trial that was cut off is marked as failed and played again, with the same values where one process searches.
+A trial trains one policy with the values that the sampler proposes. Its objective is the policy's mean outcome on fresh episodes of the
+purpose `tune`, never on those that are reported. Trials are kept as a journal of JSON lines, so that the same command goes on where an
+interrupted one stopped. A trial that was cut off is marked as failed and played again, with the same values if one process searches.
 
 A space is a mapping of dotted fields of the training's configuration to one of
 
@@ -162,7 +162,7 @@ def configured(base: TrainConfig, values: dict[str, Any]) -> TrainConfig:
     data: dict[str, Any] = {}
     for field, value in values.items():
         head, dot, leaf = field.partition(".")
-        if dot and head not in fields_of(TrainConfig):  # a learner without a field of its own
+        if dot and head not in fields_of(TrainConfig):  # a learner without a field
             head, leaf, value = "settings", head, {**data.get("settings", base.settings).get(head, {}), leaf: value}
         data[head] = {**data.get(head, getattr(base, head)), leaf: value} if dot else value
     return dataclasses.replace(base, **data)
@@ -185,8 +185,8 @@ def propose(trial: Trial, space: Space) -> dict[str, Any]:
 def objective(config: TrainConfig, policy: Path, episodes: int) -> float:
     """Return the mean outcome of a policy against the defence that it was trained on, on the purpose `tune`."""
     attack, spec, outcome = PolicyAttack(policy), Spec("defence", config.defence), outcome_of(config)
-    place = Cell("tune", config.scenario, None, config.defence, str(policy), episodes, "tune", threat=config.threat).place(attack, "black")
-    loop = place.loop(spec.make(), spec.entry.uses)
+    cell = Cell("tune", config.scenario, None, config.defence, str(policy), episodes, "tune", threat=config.threat)
+    loop = cell.place(attack, "black").loop(spec.make(), spec.entry.uses)
     size = episodes_at_once(loop.model, loop.horizon, BATCH)
     parts = [range(start, min(start + size, episodes)) for start in range(0, episodes, size)]
     return float(np.concatenate([METRICS[outcome](rollout(loop, attack, draws.keys("tune", part))) for part in parts]).mean())

@@ -89,10 +89,10 @@ class Component:
 
     def location(self, name: str) -> Location:
         """Raise InputError for a name that does not exist."""
-        for place in self.locations:
-            if place.name == name:
-                return place
-        raise unknown(f"component {self.name}: location", name, [place.name for place in self.locations])
+        for location in self.locations:
+            if location.name == name:
+                return location
+        raise unknown(f"component {self.name}: location", name, [location.name for location in self.locations])
 
 
 @dataclass(frozen=True)
@@ -152,9 +152,9 @@ class Network:
     def with_location(self, component: str, location: str, **changes: Any) -> Network:
         """Return the same network with other fields of one location."""
         held = self.component(component)
-        place = dataclasses.replace(held.location(location), **changes)
-        places = tuple(place if p.name == location else p for p in held.locations)
-        return self._with(dataclasses.replace(held, locations=places))
+        changed = dataclasses.replace(held.location(location), **changes)
+        locations = tuple(changed if one.name == location else one for one in held.locations)
+        return self._with(dataclasses.replace(held, locations=locations))
 
     def with_edge(self, component: str, source: str, target: str, **changes: Any) -> Network:
         """Return the same network with other fields of the edges from one location to another."""
@@ -193,10 +193,10 @@ def _list(data: dict[str, Any], key: str, where: str) -> list[dict[str, Any]]:
 
 def _component(data: dict[str, Any], where: str) -> Component:
     where = f"{where} ({data['name']})" if isinstance(data.get("name"), str) else where
-    places = data.get("locations", {})
-    if not isinstance(places, dict) or not all(isinstance(held, dict) for held in places.values()):
-        raise InputError(f"{where}.locations", places, "a mapping of names to fields")
-    locations = tuple(build(Location, {"name": name} | held, f"{where}, location {name}") for name, held in places.items())
+    given = data.get("locations", {})
+    if not isinstance(given, dict) or not all(isinstance(held, dict) for held in given.values()):
+        raise InputError(f"{where}.locations", given, "a mapping of names to fields")
+    locations = tuple(build(Location, {"name": name} | held, f"{where}, location {name}") for name, held in given.items())
     edges = tuple(build(Edge, held, f"{where}, edge {i}") for i, held in enumerate(_list(data, "edges", where), start=1))
     return build(Component, data | {"locations": locations, "edges": edges}, where)
 
@@ -220,30 +220,30 @@ def check(network: Network) -> None:
     sent = {edge.channel for _, edge in network.edges() if edge.sends}
     for component in network.components:
         here = f"{where}: component {component.name}"
-        names = [place.name for place in component.locations]
+        names = [location.name for location in component.locations]
         _distinct(f"{here}: locations", names, shared)
         _known(f"{here}.initial", component.initial, names)
-        for place in component.locations:
-            _check_location(f"{here}, location {place.name}", place, component)
+        for location in component.locations:
+            _check_location(f"{here}, location {location.name}", location, component)
         for i, edge in enumerate(component.edges, start=1):
             _check_edge(f"{here}, edge {i}", edge, component, known, sent, network.variables)
 
 
-def _check_location(where: str, place: Location, component: Component) -> None:
-    _atoms(f"{where}.invariant", place.invariant, component.clocks)
-    for atom in place.invariant:
+def _check_location(where: str, location: Location, component: Component) -> None:
+    _atoms(f"{where}.invariant", location.invariant, component.clocks)
+    for atom in location.invariant:
         if atom.op not in ("<", "<="):
             raise InputError(f"{where}.invariant", str(atom), "upper limits (< or <=) only")
-    if place.committed and place.invariant:
-        raise InputError(f"{where}.invariant", [str(a) for a in place.invariant], "none, as a committed location is left at once")
-    for clock, speed in place.rates.items():
+    if location.committed and location.invariant:
+        raise InputError(f"{where}.invariant", [str(a) for a in location.invariant], "none, as a committed location is left at once")
+    for clock, speed in location.rates.items():
         _known(f"{where}.rates", clock, component.clocks)
         if isinstance(speed, tuple) and speed[0] > speed[1]:
             raise InputError(f"{where}.rates.{clock}", list(speed), "[low, high]")
 
 
 def _check_edge(where: str, edge: Edge, component: Component, known: Iterable[str], sent: Iterable[str], variables: dict[str, int]) -> None:
-    names = [place.name for place in component.locations]
+    names = [location.name for location in component.locations]
     _known(f"{where}.source", edge.source, names)
     _known(f"{where}.target", edge.target, names)
     _atoms(f"{where}.guard", edge.guard, known)

@@ -28,15 +28,15 @@ def automata_figure(network: Network, untrusted: Collection[str] = ()) -> Figure
     return figure
 
 
-def place_words(place: Location, leaves: bool = True) -> str:
+def location_words(location: Location, leaves: bool = True) -> str:
     """Return what a location says of itself: invariant, clock rates, committed, and the rate where it decides itself when it is left."""
-    lines = [place.name, *map(str, place.invariant)]
-    for clock, speed in place.rates.items():
+    lines = [location.name, *map(str, location.invariant)]
+    for clock, speed in location.rates.items():
         lines.append(f"{clock}' in [{speed[0]:g}, {speed[1]:g}]" if isinstance(speed, tuple) else f"{clock}' = {speed:g}")
-    if place.committed:
+    if location.committed:
         lines.append("committed")
-    elif leaves and not place.invariant:
-        lines.append(f"rate {place.rate:g}")
+    elif leaves and not location.invariant:
+        lines.append(f"rate {location.rate:g}")
     return "\n".join(lines)
 
 
@@ -51,24 +51,24 @@ def _panel(ax: Axes, component: Component, untrusted: Collection[str]) -> None:
 
     count = len(component.locations)
     radius = RADIUS.get(count, 0.38 * count)
-    places, boxes = {}, {}
-    for j, place in enumerate(component.locations):
+    locations, boxes = {}, {}
+    for j, location in enumerate(component.locations):
         turn = 2.0 * math.pi * j / count
         at = (1.25 * radius * math.sin(turn), radius * math.cos(turn))
-        words = place_words(place, any(edge.source == place.name and not edge.hears for edge in component.edges))
+        words = location_words(location, any(edge.source == location.name and not edge.hears for edge in component.edges))
         lines = words.count("\n")
-        size = (WIDTH + (0.12 if place.rates else 0.0), HEIGHT + 0.1 * lines)
-        first = place.name == component.initial
+        size = (WIDTH + (0.12 if location.rates else 0.0), HEIGHT + 0.1 * lines)
+        first = location.name == component.initial
         box = FancyBboxPatch(
             (at[0] - size[0], at[1] - size[1]), 2 * size[0], 2 * size[1], boxstyle="round,pad=0.02,rounding_size=0.14", facecolor=NODE,
             edgecolor=INK, linewidth=2.6 if first else 1.2, zorder=3,
         )  # fmt: skip
         ax.add_patch(box)
         ax.text(*at, words, ha="center", va="center", fontsize=9, color=INK, zorder=4)
-        places[place.name], boxes[place.name] = at, box
+        locations[location.name], boxes[location.name] = at, box
     pairs = [(edge.source, edge.target) for edge in component.edges]
     for number, edge in enumerate(component.edges):
-        start, end = places[edge.source], places[edge.target]
+        start, end = locations[edge.source], locations[edge.target]
         dx, dy = end[0] - start[0], end[1] - start[1]
         back = (edge.target, edge.source) in pairs or pairs.index((edge.source, edge.target)) != number
         bend = -0.5 if back else -0.2

@@ -1,8 +1,8 @@
 """The price of detection: false alarms where nobody attacks, and from when on `detects` does not count.
 
 An alarm that is on at random is on soon after anything. So detection counts in a scenario where the mean time between false alarms of its
-clean run is no shorter than `Demands.false_alarms`. An alarm that stays on counts again each time that the deadline of a detection has
-passed: an attack at that time would be found by it.
+clean run is no shorter than `Demands.false_alarms`. An alarm that stays on counts again after each deadline of a detection:
+it would find an attack at that time.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class Price(NamedTuple):
 def prices(rows: Sequence[Row], limit: float, nominal: Sequence[str]) -> dict[tuple[str, str], Price]:
     """Judge the first clean row of each defence and scenario. `limit`: shortest mean time between false alarms [h].
 
-    `nominal` scenarios are judged. In others the vehicle is not the one that the defence knows, and a lucky detection raises no bound
-    there, as the worst scenario makes it.
+    `nominal` scenarios are judged. In others the vehicle is not the one that the defence knows. A lucky detection raises no bound there,
+    as the worst scenario decides.
     """
     out: dict[tuple[str, str], Price] = {}
     for row in rows:

@@ -1,7 +1,7 @@
 """Bounded temporal logic over sampled traces, for a whole batch at once: formulas, and their truth or robustness.
 
-A formula is read at a sample. Atoms compare sums of signals; F, G and U look ahead over a closed interval of seconds, counted from the
-sample that they are read at. Two semantics: boolean, and the robustness of Fainekos and Pappas (2009) and Donze and Maler (2010): by how
+A formula is read at a sample. Atoms compare sums of signals. F, G and U look ahead over a closed interval of seconds, which begins
+at that sample. Two semantics: boolean, and the robustness of Fainekos and Pappas (2009) and Donze and Maler (2010): by how
 much the signals may change before the truth does. A robustness above 0 means true, one below 0 false.
 
 A window that runs past an episode's end holds the samples that there are. Over none G is true, and F and U are false (the neutral view
@@ -153,6 +153,8 @@ class Atom(Formula):
 
 @dataclass(frozen=True)
 class Not(Formula):
+    """The negation of a formula."""
+
     of: Formula
 
     @property

@@ -2,7 +2,7 @@
 
     no_collision   G (gap > 0 and rear_gap > 0)
     brakes         whenever a gap is unsafe once an attack has begun, that car begins to brake within 0.6 s, strictly later, and
-                   brakes on for 0.5 s, or stands, or is safe again
+                   brakes on for 0.5 s, or stops, or is safe again
     detects        an alarm within ten steps of the first step of an attack; it counts under a limit of false alarms (false_alarms.py)
     error          G (error <= bound), where nobody drives
 
@@ -123,15 +123,15 @@ def _error(model: Model, bound: float | None) -> Property:
     return Property("error", f"the estimate's error stays within {bound:g}", Always(_over("error", -1.0, -bound, False)))
 
 
-def built_in(place: Scenario, bound: float | None = None, asked: Demands | None = None) -> tuple[Property, ...]:
+def built_in(scenario: Scenario, bound: float | None = None, asked: Demands | None = None) -> tuple[Property, ...]:
     """Return the built-in properties of a scenario; `bound` is the suite's, of an error where nobody drives."""
-    model, asked = place.brief().model, asked or Demands()
-    return _no_collision(model), _brakes(model, place.horizon, asked), _detects(model, place.horizon, asked), _error(model, bound)
+    model, asked = scenario.brief().model, asked or Demands()
+    return _no_collision(model), _brakes(model, scenario.horizon, asked), _detects(model, scenario.horizon, asked), _error(model, bound)
 
 
-def own(place: Scenario, texts: Sequence[str]) -> tuple[Property, ...]:
+def own(scenario: Scenario, texts: Sequence[str]) -> tuple[Property, ...]:
     """Return a user's formulas as properties. Raises InputError for one that cannot be read, or whose window begins too late."""
-    out, model = [], place.brief().model
+    out, model = [], scenario.brief().model
     for text in texts:
         formula = parse(text, FLAGS)
         try:
@@ -139,7 +139,7 @@ def own(place: Scenario, texts: Sequence[str]) -> tuple[Property, ...]:
         except NotApplicable as error:
             out.append(Property(text, text, None, reason=str(error)))
             continue
-        _fits(formula, model.dt, place.horizon, 0)
+        _fits(formula, model.dt, scenario.horizon, 0)
         out.append(Property(text, text, formula))
     return tuple(out)
 

@@ -55,8 +55,10 @@ def _whole(suite: Suite) -> bool:
 
 
 def _counted(rows: Sequence[Row], whole: bool) -> list[Row]:
-    """Return the rows that bounds are over. Optima are ceilings; an attack that fits no defence of the suite in a scenario is left out
-    there, which only a report on all of them can tell."""
+    """Return the rows that bounds are over.
+
+    Optima are ceilings, and do not count. A report on the `whole` suite leaves an attack out in a scenario where it fits no defence.
+    """
     fits = {(row["scenario"], row["attack"]) for row in rows if row["status"] != "skipped" or not whole}
     return [row for row in rows if not row["optimal"] and (row["scenario"], row["attack"]) in fits]
 

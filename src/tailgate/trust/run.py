@@ -1,8 +1,8 @@
 """Statistical model checking of a suite: cells to rows, and rows to what they say of each defence.
 
-The trust of a defence is a lower bound: in the worst of these scenarios, doses and attacks, a closed list that is named, a run satisfies
-all properties together with at least this probability. One boolean a run, so that nothing is assumed of how properties depend on each
-other: a product of their probabilities would be wrong, and Frechet's bound is all that they allow. alpha is split over the cells.
+The trust of a defence is a lower bound. A run satisfies all properties together with at least this probability, in the worst of a closed
+list of scenarios, doses and attacks. One boolean a run makes no assumption on how properties depend on each other. A product of their
+probabilities would be wrong; they allow no more than Frechet's bound. alpha is split over the cells.
 """
 
 from __future__ import annotations
@@ -124,8 +124,8 @@ def check(
     """Play, and return the report on a suite's defences, in the format tailgate-trust-1; docs/trust.md says what its fields mean.
 
     runs: of each cell, the suite's number of seeds unless given; with a rule the most that it may take. formulas: in place of the built-in
-    properties. With `folder` it is also written there as trust.json, with the rows of cells and the worst failing episode of each
-    defence, as rows for `tailgate replay`. Raises InputError before anything is played.
+    properties. With `folder` it is also written there as trust.json, next to the rows of cells. The worst failing episodes of the
+    defences are written as rows for `tailgate replay`. Raises InputError before anything is played.
     """
     if not 0.0 < alpha < 1.0:
         raise InputError("alpha", alpha, "a number above 0 and below 1")
@@ -199,7 +199,8 @@ def with_trust(board: dict[str, Any], found: object, where: str = "trust", suite
     the report does not know has null. So has one that is not built in: its rows are not mixed with others, and its batch would tell it
     who is attacked.
 
-    Raises InputError for what is no report, and for one of another suite, version or round, of own formulas or of runs that a rule stopped.
+    Raises InputError for anything but a report, and for a report of another suite, version or round. The same goes for a report of own
+    formulas, or of runs that a rule stopped.
     """
     if not isinstance(found, Mapping) or found.get("format") != FORMAT:
         raise InputError(f"{where}: format", found.get("format") if isinstance(found, Mapping) else found, FORMAT)

@@ -62,7 +62,7 @@ def _attacked(trace: Trace, _: SafeDistance) -> Array:
 
 
 def _so_far(once: bool) -> Callable[[Trace, SafeDistance], Array]:
-    """Return a signal that is on from the first step in which a command took effect, or in that step alone; the same for all agents."""
+    """Return a signal that is on from the first step in which a command took effect, or `once`, in that step alone. Agents share it."""
 
     def of(trace: Trace, _: SafeDistance) -> Array:
         on = np.asarray(trace.kind != 0)

@@ -1,10 +1,13 @@
 """Random runs of a network of stochastic timed automata, many side by side; a run depends on its own seed alone, to the bit.
 
-Semantics (David et al., "Statistical model checking for networks of priced timed automata", FORMATS 2011): a component whose invariant
-ends draws its delay uniformly from [earliest moment at which it can move, end of the invariant], one without an invariant from the
-earliest moment on exponentially with the rate of its location; one in a committed location waits for nothing and goes before all others.
-The shortest delay wins, and its component takes one of the edges that are then open to it, each as likely; every other component that
-listens to what it sends moves with it, and nobody waits for listeners. If none is open by then, everybody draws again.
+Semantics: David et al., "Statistical model checking for networks of priced timed automata", FORMATS 2011. Each component draws a delay:
+
+        with an invariant that ends    uniform in [earliest moment at which it can move, end of the invariant]
+        without one                    exponential with the rate of its location, from the earliest moment on
+        in a committed location        none: it goes before all others
+
+The shortest delay wins, and its component takes one of the edges that are then open to it, each as likely. Every other component that
+listens to what it sends moves with it; nobody waits for listeners. If none is open by then, everybody draws again.
 """
 
 from __future__ import annotations
@@ -42,7 +45,7 @@ class Plan(NamedTuple):
 
     network: Network
     row: dict[str, int]  # of clocks (time first), then variables
-    places: tuple[dict[str, int], ...]
+    locations: tuple[dict[str, int], ...]
     edges: tuple[Any, ...]  # (component, Edge)
 
 
@@ -52,13 +55,14 @@ class State(NamedTuple):
     run: Array  # (A,) which of the B
     value: Array  # (V, A)
     speed: Array  # (V, A) of clocks; 0 for variables
-    place: Array  # (C, A)
+    location: Array  # (C, A)
 
 
 def prepare(network: Network) -> Plan:
+    """Return a network with the rows of its values, the indices of its locations, and its edges."""
     row = {name: i for i, name in enumerate((TIME, *network.clocks, *network.variables))}
-    places = tuple({place.name: i for i, place in enumerate(c.locations)} for c in network.components)
-    return Plan(network, row, places, tuple(network.edges()))
+    locations = tuple({location.name: i for i, location in enumerate(c.locations)} for c in network.components)
+    return Plan(network, row, locations, tuple(network.edges()))
 
 
 def holds(plan: Plan, atoms: Atoms, value: Array) -> Array:
@@ -114,7 +118,8 @@ def simulate(
 
     queries: what to look for, the network's own if not given; within: how long, as the longest query says if not given. stop: a run ends
     as soon as all of them have held, or no longer can as their time is over. One in which nobody can move any more lasts to the end. Raises
-    InputError for a run of more than `steps` moves or a thousand in no time (Zeno), or in which a component may neither stay nor go.
+    InputError for a run of more than `steps` moves or a thousand in no time (Zeno). The same goes for a component that may neither stay
+    nor go.
     """
     plan, asked = prepare(network), tuple(network.queries if queries is None else queries)
     until = float(within) if within is not None else max((query.within for query in asked), default=math.nan)
@@ -141,7 +146,7 @@ def simulate(
 def _passes(plan: Plan, state: State, good: Array, moves: int, until: float) -> None:
     if not good.all():
         run = int(np.argmin(good))
-        words = f"{moves} moves by time {state.value[0, run]:g} ({_words(plan, state.place[:, run])})"
+        words = f"{moves} moves by time {state.value[0, run]:g} ({_words(plan, state.location[:, run])})"
         raise InputError("automata", words, f"a run that gets to time {until:g}")
 
 
@@ -152,17 +157,17 @@ def _start(plan: Plan, keys: Keys) -> State:
         value[plan.row[name]] = first
     speed = np.zeros_like(value)
     speed[: 1 + len(network.clocks)] = 1.0
-    place = np.array([[plan.places[i][c.initial]] for i, c in enumerate(network.components)]) * np.ones((1, batch), np.int64)
+    location = np.array([[plan.locations[i][c.initial]] for i, c in enumerate(network.components)]) * np.ones((1, batch), np.int64)
     u = keys.at(Role.PROCESS, np.zeros(batch, np.int64)).uniform((len(plan.row),)).T
-    _enter(plan, speed, place, np.ones(place.shape, bool), u)
-    return State(np.arange(batch), value, speed, place)
+    _enter(plan, speed, location, np.ones(location.shape, bool), u)
+    return State(np.arange(batch), value, speed, location)
 
 
-def _enter(plan: Plan, speed: Array, place: Array, moved: Array, u: Array) -> None:
+def _enter(plan: Plan, speed: Array, location: Array, moved: Array, u: Array) -> None:
     """Set how fast the clocks of components that moved (C, A) run where they are now; u (V, A) draws what is drawn."""
     for i, component in enumerate(plan.network.components):
         for j, where in enumerate(component.locations):
-            here = moved[i] & (place[i] == j)
+            here = moved[i] & (location[i] == j)
             for clock in component.clocks if here.any() else ():
                 row, rate = plan.row[clock], where.rates.get(clock, 1.0)
                 low, high = rate if isinstance(rate, tuple) else (rate, rate)
@@ -171,7 +176,7 @@ def _enter(plan: Plan, speed: Array, place: Array, moved: Array, u: Array) -> No
 
 def _move(plan: Plan, state: State, keys: Keys, step: int, until: float, asked: tuple[Query, ...], stop: bool, out: Runs) -> State:
     """Move every run that goes on once; write what ended into `out`."""
-    count, parts, edges = len(state.run), len(plan.places), len(plan.edges)
+    count, parts, edges = len(state.run), len(plan.locations), len(plan.edges)
     own = Keys(keys.key[state.run], keys.episode[state.run])
     u = own.at(Role.PROCESS, np.full(count, step)).uniform((2 * parts + edges + len(plan.row),)).T
     wait, tie, choice, rates = np.split(u, np.cumsum([parts, parts, edges]))
@@ -185,7 +190,7 @@ def _move(plan: Plan, state: State, keys: Keys, step: int, until: float, asked: 
         last = hit.max(axis=0)  # NaN as long as one has not held
         decided = ~(np.isnan(hit) & (now <= np.array([_expires(query) for query in asked])[:, None])).any(axis=0)
         ends, over = np.where(decided, np.where(np.isnan(last), now, last), until), over | decided
-    out.time[state.run[over]], out.location[:, state.run[over]] = ends[over], state.place[:, over]
+    out.time[state.run[over]], out.location[:, state.run[over]] = ends[over], state.location[:, over]
     go = ~over
     out.steps[state.run[go]] += 1
     state = state._replace(value=state.value + state.speed * np.where(go, shortest, 0.0))
@@ -209,10 +214,11 @@ def _look(plan: Plan, state: State, passed: Array, asked: tuple[Query, ...], out
 
 def _delays(plan: Plan, state: State, u: Array, until: float) -> Array:
     """Return (C, A) what each component draws; infinite for one that waits for others."""
-    delay, limit, urgent = np.full(state.place.shape, np.inf), np.full(state.place.shape, np.inf), np.zeros(state.place.shape, bool)
+    shape = state.location.shape
+    delay, limit, urgent = np.full(shape, np.inf), np.full(shape, np.inf), np.zeros(shape, bool)
     for i, component in enumerate(plan.network.components):
         for j, where in enumerate(component.locations):
-            here = np.flatnonzero(state.place[i] == j)
+            here = np.flatnonzero(state.location[i] == j)
             if not len(here):
                 continue
             value, speed = state.value[:, here], state.speed[:, here]
@@ -238,7 +244,7 @@ def _delays(plan: Plan, state: State, u: Array, until: float) -> Array:
     if stuck.any():
         run = int(np.argmax(stuck))
         raise InputError(
-            "automata", f"time {state.value[0, run]:g} ({_words(plan, state.place[:, run])})",
+            "automata", f"time {state.value[0, run]:g} ({_words(plan, state.location[:, run])})",
             f"a way for {plan.network.components[int(limit[:, run].argmin())].name} out of a place where it may not stay",
         )  # fmt: skip
     return delay
@@ -247,7 +253,7 @@ def _delays(plan: Plan, state: State, u: Array, until: float) -> Array:
 def _fire(plan: Plan, state: State, first: Array, tie: Array, choice: Array, rates: Array, out: Runs) -> State:
     """Return the winner's move and its listeners'; `first` (C, A) marks whose delay was the shortest."""
     winner = np.where(first, tie, np.inf).argmin(axis=0)
-    open_ = np.array([holds(plan, e.guard, state.value) & (state.place[i] == plan.places[i][e.source]) for i, e in plan.edges])
+    open_ = np.array([holds(plan, e.guard, state.value) & (state.location[i] == plan.locations[i][e.source]) for i, e in plan.edges])
     component = np.array([i for i, _ in plan.edges])[:, None]
     hears = np.array([e.hears for _, e in plan.edges])[:, None]
     go = _one_of(open_ & ~hears & (component == winner), choice)
@@ -257,19 +263,19 @@ def _fire(plan: Plan, state: State, first: Array, tie: Array, choice: Array, rat
             said[edge.channel] |= go[e]
     heard = np.array([said[e.channel] if e.hears else np.zeros(go.shape[1], bool) for _, e in plan.edges])
     listening = open_ & heard & (component != winner)
-    for i in range(len(plan.places)):
+    for i in range(len(plan.locations)):
         go |= _one_of(listening & (component == i), choice)
-    value, place, speed = state.value.copy(), state.place.copy(), state.speed.copy()
-    moved = np.zeros(place.shape, bool)
+    value, location, speed = state.value.copy(), state.location.copy(), state.speed.copy()
+    moved = np.zeros(location.shape, bool)
     for e in sorted(range(len(plan.edges)), key=lambda e: plan.edges[e][1].hears):  # who speaks sets first
         i, edge = plan.edges[e]
         for name, new in edge.assign.items():
             value[plan.row[name], go[e]] = new
-        place[i, go[e]] = plan.places[i][edge.target]
+        location[i, go[e]] = plan.locations[i][edge.target]
         moved[i] |= go[e]
         out.taken[e, state.run] += go[e]
-    _enter(plan, speed, place, moved, rates)
-    return State(state.run, value, speed, place)
+    _enter(plan, speed, location, moved, rates)
+    return State(state.run, value, speed, location)
 
 
 def _one_of(may: Array, score: Array) -> Array:
@@ -278,5 +284,5 @@ def _one_of(may: Array, score: Array) -> Array:
     return np.asarray(may & (np.arange(len(may))[:, None] == best))
 
 
-def _words(plan: Plan, place: Array) -> str:
-    return ", ".join(f"{c.name} in {c.locations[j].name}" for c, j in zip(plan.network.components, place, strict=True))
+def _words(plan: Plan, location: Array) -> str:
+    return ", ".join(f"{c.name} in {c.locations[j].name}" for c, j in zip(plan.network.components, location, strict=True))

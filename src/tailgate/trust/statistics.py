@@ -1,6 +1,6 @@
 """How many runs, and what their outcomes say: exact intervals, tests that stop by themselves, and their true error rates.
 
-Published figures use a number of runs that is fixed beforehand. The rules that stop early are for exploring: an interval that is looked at
+Published figures use a number of runs that is fixed beforehand. The rules that stop early are for exploring. An interval that is looked at
 after every run until it is narrow misses more often than it says (`Sequential.coverage`).
 """
 
@@ -161,9 +161,9 @@ class Rates(NamedTuple):
 class Sprt:
     """Wald's sequential test of p >= high against p <= low, with limits 1 / alpha and beta for the likelihood ratio.
 
-    Says p <= low though p >= high with a chance of at most alpha, and the other way round with at most beta: with these limits both hold
-    exactly (Ville's inequality), where Wald's own (1 - beta) / alpha and beta / (1 - alpha) hold but nearly. Between low and high either
-    answer is right.
+    The answer is p <= low though p >= high with a chance of at most alpha, and the other way round with at most beta. With these limits
+    both hold exactly (Ville's inequality); Wald's own (1 - beta) / alpha and beta / (1 - alpha) hold only nearly. Between low and high
+    either answer is right.
     """
 
     low: float = 0.85

@@ -27,8 +27,9 @@ def signals(network: Network) -> list[str]:
 def influences(network: Network) -> dict[Node, list[Node]]:
     """Return what each name, location and edge has an influence on.
 
-    A name on the edges whose guard reads it and on those that leave a location whose invariant reads it; a location on the edges that
-    leave it; an edge on the location that it leads to, on what it sets, and on those who hear it.
+    - a name: the edges whose guard reads it, and those that leave a location whose invariant reads it
+    - a location: the edges that leave it
+    - an edge: the location that it leads to, what it sets, and those who hear it
     """
     out: dict[Node, list[Node]] = {}
 

@@ -42,7 +42,7 @@ class Names(NamedTuple):
     rates: dict[str, str]  # by clock: the variable that holds the rate which was drawn
     templates: tuple[str, ...]  # by component
     processes: tuple[str, ...]
-    places: tuple[dict[str, str], ...]  # of locations, by component
+    locations: tuple[dict[str, str], ...]  # of locations, by component
     entries: tuple[str, ...]
 
 
@@ -65,22 +65,24 @@ def _named(wanted: list[str], taken: set[str]) -> dict[str, str]:
 
 
 def names_of(network: Network) -> Names:
+    """Return identifiers of UPPAAL for all names of a network, no two alike in a scope."""
     taken: set[str] = set()
     shared = _named([TIME, *network.clocks, *network.variables, *network.channels], taken)
-    drawn = dict.fromkeys(clock for c in network.components for place in c.locations for clock in draws_of(place))
+    drawn = dict.fromkeys(clock for c in network.components for location in c.locations for clock in draws_of(location))
     rates = {clock: _named([f"rate_{clock}"], taken)[f"rate_{clock}"] for clock in drawn}
     parts = [c.name for c in network.components]
     templates = tuple(_named([f"{name}_template" for name in parts], taken).values())
     processes = tuple(_named([f"{name}_process" for name in parts], taken).values())
-    places, entries = [], []
+    locations, entries = [], []
     for component in network.components:
         local = set(taken)  # a location's name would hide a shared one
-        places.append(_named([place.name for place in component.locations], local))
+        locations.append(_named([location.name for location in component.locations], local))
         entries.append(identifier(ENTRY, local))
-    return Names(shared, rates, templates, processes, tuple(places), tuple(entries))
+    return Names(shared, rates, templates, processes, tuple(locations), tuple(entries))
 
 
 def number(value: float) -> str:
+    """Return a number as UPPAAL reads it: whole ones without a point."""
     return str(int(value)) if value == int(value) and abs(value) <= LITERAL else repr(float(value))
 
 
@@ -97,18 +99,19 @@ def condition(atoms: tuple[Atom, ...], names: Names) -> str:
 
 
 def formula(query: Query, names: Names) -> str:
+    """Return a query in UPPAAL's language."""
     return f"Pr[<={number(query.within)}](<> {condition(query.holds, names)})"
 
 
-def draws_of(place: Location) -> dict[str, tuple[float, float]]:
+def draws_of(location: Location) -> dict[str, tuple[float, float]]:
     """Return clocks whose rate is drawn on entry."""
-    return {clock: speed for clock, speed in place.rates.items() if isinstance(speed, tuple)}
+    return {clock: speed for clock, speed in location.rates.items() if isinstance(speed, tuple)}
 
 
-def invariant(place: Location, names: Names) -> str:
+def invariant(location: Location, names: Names) -> str:
     """Return limits, and the rates of clocks that do not run at 1."""
-    rates = [f"{names.shared[clock]}' == {_speed(clock, speed, names)}" for clock, speed in place.rates.items()]
-    return " && ".join([*([condition(place.invariant, names)] if place.invariant else []), *rates])
+    rates = [f"{names.shared[clock]}' == {_speed(clock, speed, names)}" for clock, speed in location.rates.items()]
+    return " && ".join([*([condition(location.invariant, names)] if location.invariant else []), *rates])
 
 
 def _speed(clock: str, speed: Speed, names: Names) -> str:
@@ -124,8 +127,8 @@ def assignment(edge: Edge, component: Component, names: Names) -> str:
     return ", ".join([*sets, *_drawn(component.location(edge.target), names)])
 
 
-def _drawn(place: Location, names: Names) -> list[str]:
-    return [f"{names.rates[clock]} = {number(low)} + random({number(high - low)})" for clock, (low, high) in draws_of(place).items()]
+def _drawn(location: Location, names: Names) -> list[str]:
+    return [f"{names.rates[clock]} = {number(low)} + random({number(high - low)})" for clock, (low, high) in draws_of(location).items()]
 
 
 def declaration(network: Network, names: Names) -> str:
@@ -156,24 +159,24 @@ def element(network: Network) -> ElementTree.Element:
 
 
 def _template(network: Network, which: int, names: Names) -> ElementTree.Element:
-    component, prefix, places = network.components[which], f"c{which}", names.places[which]
+    component, prefix, locations = network.components[which], f"c{which}", names.locations[which]
     out = ElementTree.Element("template")
     _text(out, "name", names.templates[which])
-    ids = {place.name: f"{prefix}_{j}" for j, place in enumerate(component.locations)}
+    ids = {location.name: f"{prefix}_{j}" for j, location in enumerate(component.locations)}
     first, count = component.location(component.initial), len(component.locations)
     entry = f"{prefix}_{ENTRY}" if draws_of(first) else ""
-    for j, place in enumerate(component.locations):
+    for j, location in enumerate(component.locations):
         turn = 2.0 * math.pi * j / count
         x, y = round(SPREAD * math.sin(turn)), round(-SPREAD * math.cos(turn))
-        held = _place(out, ids[place.name], places[place.name], x, y)
-        if place.rates or place.invariant:
-            _text(held, "label", invariant(place, names), kind="invariant")
-        if not place.invariant and not place.committed:
-            _text(held, "label", number(place.rate), kind="exponentialrate")
-        if place.committed:
+        held = _location(out, ids[location.name], locations[location.name], x, y)
+        if location.rates or location.invariant:
+            _text(held, "label", invariant(location, names), kind="invariant")
+        if not location.invariant and not location.committed:
+            _text(held, "label", number(location.rate), kind="exponentialrate")
+        if location.committed:
             ElementTree.SubElement(held, "committed")
     if entry:
-        ElementTree.SubElement(_place(out, entry, names.entries[which], -2 * SPREAD, -2 * SPREAD), "committed")
+        ElementTree.SubElement(_location(out, entry, names.entries[which], -2 * SPREAD, -2 * SPREAD), "committed")
     ElementTree.SubElement(out, "init", ref=entry or ids[component.initial])
     if entry:
         _transition(out, entry, ids[first.name], {"assignment": ", ".join(_drawn(first, names))})
@@ -184,7 +187,7 @@ def _template(network: Network, which: int, names: Names) -> ElementTree.Element
     return out
 
 
-def _place(parent: ElementTree.Element, identity: str, name: str, x: int, y: int) -> ElementTree.Element:
+def _location(parent: ElementTree.Element, identity: str, name: str, x: int, y: int) -> ElementTree.Element:
     out = ElementTree.SubElement(parent, "location", id=identity, x=str(x), y=str(y))
     _text(out, "name", name)
     return out
