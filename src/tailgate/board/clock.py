@@ -16,9 +16,9 @@ from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.provenance import commit, processor
 from tailgate.base.version import VERSION
 from tailgate.core import Array, Defence, Estimate, Received, draws, no_command
-from tailgate.core.components import P, S
 from tailgate.core.draws import Draws
 from tailgate.core.loop import Loop
+from tailgate.core.nouns import P, S
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_scenario
 

@@ -11,6 +11,7 @@ from tailgate.ensemble.search import EFFORTS
 
 
 def add(commands: Commands) -> None:
+    """Add the command."""
     command = commands.add_parser(
         "attack", help="find the scripts that do most harm to a defence, and compare them with a suite's attacks",
         description="Search scripts of every granted family, on every set of wires, with every trigger, against a defence. The best one "
