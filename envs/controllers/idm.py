@@ -1,6 +1,6 @@
 """The Intelligent Driver Model (Treiber, Hennecke, Helbing 2000): a human-like driver behind, and a controller to compare with.
 
-    a = a_max (1 - (v/v0)^4 - (s*/s)^2)        s* = s0 + max(0, v T + v (v - v_l) / (2 sqrt(a_max b)))
+a = a_max (1 - (v/v0)^4 - (s*/s)^2)        s* = s0 + max(0, v T + v (v - v_l) / (2 sqrt(a_max b)))
 """
 
 from dataclasses import dataclass

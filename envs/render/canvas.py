@@ -171,6 +171,7 @@ class Canvas:
 
 
 def header(canvas: Canvas, loop: Loop, state: LoopState, row: int, refused: bool) -> None:
+    """Draw the bar above the road: time, attack, budget and alarm."""
     steps, dt, last = int(state.k[row]) - 1, loop.model.dt, state.channel.last
     canvas.box(0, 0, WIDTH, HEADER, PALE)
     canvas.text(MARGIN, FIRST, f"t = {steps * dt:.{1 if dt >= 0.1 else 2}f} s", size=LARGE, bold=True)

@@ -7,8 +7,9 @@ from collections.abc import Collection
 
 import numpy as np
 
-from tailgate.core.registry import Entry, built_in, split_text
+from tailgate.core.registry import Entry, built_in
 from tailgate.core.scenario import Suite
+from tailgate.core.spec_text import split_text
 from tailgate.evaluation.paired import class_of
 from tailgate.evaluation.rounds import numbered
 from tailgate.evaluation.rows import CLEAN, Row

@@ -10,7 +10,7 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
-from tailgate.core.registry import split_text
+from tailgate.core.spec_text import split_text
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,8 @@ Number = Array | float
 
 
 class ChannelPlan(NamedTuple):
+    """The threat model as arrays."""
+
     threat: ThreatModel
     granted: Array  # (N, w) bool
     kinds: Array  # (kinds,) bool

@@ -76,6 +76,8 @@ def check_estimate(estimate: Estimate, model: Model, batch: int, k: Array) -> No
 
 
 class LoopPlan(NamedTuple):
+    """The plans of all components."""
+
     plant: object
     sensor: object
     controller: object

@@ -62,8 +62,10 @@ class Rules(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Filtering:
-    """A linear system as a Kalman filter takes it: A (n, n), C (q, n), Q (n, n), R (q, q); `lost` (q,) bool: the readings that an attack
-    stops."""
+    """A linear system as a Kalman filter takes it: A (n, n), C (q, n), Q (n, n), R (q, q).
+
+    `lost` (q,) bool names the readings that an attack stops.
+    """
 
     A: Array
     C: Array

@@ -1,4 +1,4 @@
-"""Detectability with reachability in the graph: can each agent know the whole state from what it and its neighbours measure?"""
+"""Detectability with reachability in the graph: whether each agent can know the whole state from its own and its neighbours' readings."""
 
 from __future__ import annotations
 

@@ -8,7 +8,6 @@ import hashlib
 import importlib
 import inspect
 import json
-import re
 import sys
 import traceback
 import warnings
@@ -22,6 +21,7 @@ from typing import Any, Literal, TypedDict, TypeVar, Unpack
 from tailgate.base.errors import InputError, unknown
 from tailgate.base.lazy import components, loaded
 from tailgate.core.schema import as_data, build, fields_of, scalar
+from tailgate.core.spec_text import put_in, split_items, split_text
 
 Family = Literal["defence", "filter", "detector", "mitigation", "attack", "plant", "sensor", "controller", "manoeuvre", "reward", "learner"]
 USES = ("measurements", "odometry", "probe", "v2v", "redundant", "leader_input", "truth")
@@ -110,6 +110,7 @@ def register(family: Family, name: str, **card: Unpack[Card]) -> Callable[[T], T
 
 
 def put(entry: Entry) -> None:
+    """Add an entry; raise InputError for a taken name or an unknown use."""
     for use in entry.uses:
         if use not in USES:
             raise unknown(f"{entry.name}.uses", use, USES)
@@ -187,6 +188,7 @@ def entries(family: Family) -> dict[str, Entry]:
 
 
 def find(family: Family, name: str) -> Entry:
+    """Return the entry of a name; raise InputError that lists the known ones."""
     if found := _at_home(family, name):
         return found
     known = _load(family)
@@ -226,11 +228,11 @@ class Spec:
     def _parts(self) -> tuple[str, dict[str, Any]]:
         head, tail = split_text(self.text)
         params: dict[str, Any] = {}
-        for item in _split(tail) if tail else ():
+        for item in split_items(tail) if tail else ():
             key, eq, value = item.partition("=")
             if not eq:
                 raise InputError(self.family, self.text, "name:key=value,key=value")
-            _put(params, key.strip(), scalar(value))
+            put_in(params, key.strip(), scalar(value))
         return head, params
 
     def _imported(self) -> list[tuple[Family, str]]:
@@ -367,34 +369,7 @@ def imported(family: Family, text: str) -> Entry:
     return entry_of(family, text, cls)
 
 
-def split_text(text: str) -> tuple[str, str]:
-    """Return head and parameters of a component's text: `name` and `key=value,...`, or the text and nothing."""
-    found = re.fullmatch(r"(.*?):(\s*[A-Za-z_][\w.]*\s*=.*)", text, re.DOTALL)
-    return (found[1], found[2]) if found else (text, "")
-
-
 def _takes(function: Callable[..., Any]) -> float:
     """Return how many arguments a method takes at most."""
     kinds = [p.kind for p in inspect.signature(function).parameters.values()]
     return float("inf") if inspect.Parameter.VAR_POSITIONAL in kinds else len(kinds)
-
-
-def _put(params: dict[str, Any], key: str, value: object) -> None:
-    """Set params[key] to the value; `part.key` goes into the mapping of the part, which may already hold a name."""
-    part, dot, inner = key.partition(".")
-    held = params.get(part)
-    if not dot:
-        params[part] = held | {"name": value} if isinstance(held, dict) else value
-    else:
-        params[part] = {**(held if isinstance(held, dict) else {"name": held} if held is not None else {}), inner: value}
-
-
-def _split(text: str) -> list[str]:
-    """Split at commas outside of brackets."""
-    out, depth, start = [], 0, 0
-    for i, ch in enumerate(text):
-        depth += (ch in "[({") - (ch in "])}")
-        if ch == "," and depth == 0:
-            out.append(text[start:i])
-            start = i + 1
-    return [*out, text[start:]]

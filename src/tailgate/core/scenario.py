@@ -158,10 +158,12 @@ def config_path(folder: str, name: str, where: str) -> Path:
 
 
 def list_scenarios() -> list[str]:
+    """Return the names of the scenarios that come with the package."""
     return list(_builtin("scenarios"))
 
 
 def list_suites() -> list[str]:
+    """Return the names of the suites that come with the package."""
     return list(_builtin("suites"))
 
 

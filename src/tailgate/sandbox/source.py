@@ -13,7 +13,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from tailgate.base.errors import InputError
-from tailgate.core.registry import split_text
+from tailgate.core.spec_text import split_text
 
 LARGEST = 2**30  # [bytes] of a submission with its weights
 _LEFT_OUT = ("__pycache__", ".git")
