@@ -1,6 +1,6 @@
 """Models, the threat model and its channel, the loop, random numbers, and the registry of components. The nouns are imported from here."""
 
-from tailgate.core.components import Attack, Controller, Defence, Manoeuvre, Plant, Receiver, Sensor, Sized
+from tailgate.core.components import Attack, Controller, Defence, Manoeuvre, Plant, Receiver, Sensor, Sized, View, WhiteBox
 from tailgate.core.kinds import AIRED, Kind, Mode
 from tailgate.core.nouns import (
     Air,
@@ -13,8 +13,6 @@ from tailgate.core.nouns import (
     Prior,
     Received,
     Scene,
-    View,
-    WhiteBox,
     no_command,
     pair_of,
     param,

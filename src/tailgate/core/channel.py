@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tailgate import num
-from tailgate.core.kinds import EFFECTS, Kind, Limits, Recording
+from tailgate.core.kinds import EFFECTS, Kind, Limits, Memory, Recording
 from tailgate.core.nouns import Air, Array, Command, Received, no_command
 from tailgate.core.threat import Brief, ThreatModel
 
@@ -32,15 +32,6 @@ class ChannelPlan(NamedTuple):
     sensors: int
     air: bool
     recorded: int  # samples kept for delay and replay; 0 where neither is granted
-
-
-class Memory(NamedTuple):
-    """The channel's memory of some wires: held, fresh (B, N, .); history, tape (B, N, ., recorded), two rings."""
-
-    held: Array  # last good sample before the first attack, or before the onset
-    fresh: Array  # last good sample of each wire
-    history: Array  # samples sent in the last steps
-    tape: Array  # the history as it was when the running replay began
 
 
 class ChannelState(NamedTuple):

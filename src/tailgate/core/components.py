@@ -13,13 +13,11 @@ own role: the same seed gives the same numbers, whatever the batch.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import Generic, NamedTuple, Protocol, runtime_checkable
 
 from tailgate.core.draws import Draws
-from tailgate.core.nouns import Air, Array, Command, Estimate, Model, P, Prior, Received, S, Scene, View
-
-if TYPE_CHECKING:
-    from tailgate.core.threat import Brief
+from tailgate.core.nouns import Air, Array, Command, Estimate, Model, P, Prior, Received, S, Scene
+from tailgate.core.threat import Brief
 
 
 class Sized(Protocol):
@@ -196,6 +194,35 @@ class Defence(Protocol[P, S]):
         known_u : (B, N, inputs)
             The model's input since the last step; zero where an agent does not know it.
         """
+
+
+class WhiteBox(NamedTuple, Generic[P, S]):
+    """The defence as a white-box attacker holds it. Its step is pure, so that the attacker may look ahead."""
+
+    defence: Defence[P, S]
+    plan: P
+    state: S
+    known_u: Array  # (B, N, m) the known input since the last step
+
+
+class View(NamedTuple):
+    """The part of an episode that the threat model lets an attacker see. None where it is not granted."""
+
+    k: Array  # (B,) step, from 1
+    progress: Array  # (B,) k / horizon
+    scene: Scene
+    budget_left: Array  # (B,) attack steps; inf when unlimited
+    budget: Array  # (B,) the whole budget; inf when unlimited
+    burst: Array  # (B,) steps that the present burst has lasted
+    cooldown: Array  # (B,) steps before the next burst may start
+    allowed: Array  # (B,) bool: a legal command would be accepted now
+    last: Command  # the last command that took effect
+    probed: Array | None = None  # (B, N) bool: the sensor's probe was heard in the step before; None of sensors that send none
+    control: Array | None = None  # (B, N, m) grey: the input last commanded
+    received: Received | None = None  # the defence's measurement, before this step's attack
+    defence: WhiteBox | None = None  # white: the defence object, its plan and its state
+    estimate: Estimate | None = None  # white
+    truth: Array | None = None  # white: (B, N, n)
 
 
 class Attack(Protocol[P, S]):

@@ -6,15 +6,12 @@ The numbers are part of published rows. A new kind is a member of `Kind`, its na
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
 from tailgate import num
-
-if TYPE_CHECKING:
-    from tailgate.core.channel import Memory
-    from tailgate.core.nouns import Array
+from tailgate.base.pytree import Array
 
 FAINTEST = 1e-12  # power [W] or delay [m] that a command over the air has at least
 KindName = Literal["dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "delay", "replay", "noise_jam", "echo_delay"]
@@ -44,6 +41,15 @@ class Limits(NamedTuple):
     memory: int  # longest delay, and longest window that is replayed [steps]
     power: float  # largest power of noise [W]
     delay: float  # largest extra range of a late echo [m]
+
+
+class Memory(NamedTuple):
+    """The channel's memory of some wires: held, fresh (B, N, .); history, tape (B, N, ., recorded), two rings."""
+
+    held: Array  # last good sample before the first attack, or before the onset
+    fresh: Array  # last good sample of each wire
+    history: Array  # samples sent in the last steps
+    tape: Array  # the history as it was when the running replay began
 
 
 class Recording(NamedTuple):

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,9 +30,6 @@ from tailgate.core.quantities import NonNegative as NonNegative
 from tailgate.core.quantities import Positive as Positive
 from tailgate.core.quantities import PositiveCount as PositiveCount
 from tailgate.core.quantities import Probability as Probability
-
-if TYPE_CHECKING:
-    from tailgate.core.components import Defence
 
 Array = NDArray[Any]
 P = TypeVar("P", default=Any)  # type of a component's plan
@@ -213,35 +210,6 @@ class Innovation(NamedTuple):
 
     r: Array
     S: Array
-
-
-class View(NamedTuple):
-    """The part of an episode that the threat model lets an attacker see. None where it is not granted."""
-
-    k: Array  # (B,) step, from 1
-    progress: Array  # (B,) k / horizon
-    scene: Scene
-    budget_left: Array  # (B,) attack steps; inf when unlimited
-    budget: Array  # (B,) the whole budget; inf when unlimited
-    burst: Array  # (B,) steps that the present burst has lasted
-    cooldown: Array  # (B,) steps before the next burst may start
-    allowed: Array  # (B,) bool: a legal command would be accepted now
-    last: Command  # the last command that took effect
-    probed: Array | None = None  # (B, N) bool: the sensor's probe was heard in the step before; None of sensors that send none
-    control: Array | None = None  # (B, N, m) grey: the input last commanded
-    received: Received | None = None  # the defence's measurement, before this step's attack
-    defence: WhiteBox | None = None  # white: the defence object, its plan and its state
-    estimate: Estimate | None = None  # white
-    truth: Array | None = None  # white: (B, N, n)
-
-
-class WhiteBox(NamedTuple, Generic[P, S]):
-    """The defence as a white-box attacker holds it. Its step is pure, so that the attacker may look ahead."""
-
-    defence: Defence[P, S]
-    plan: P
-    state: S
-    known_u: Array  # (B, N, m) the known input since the last step
 
 
 class Frame(NamedTuple):

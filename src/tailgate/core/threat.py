@@ -9,18 +9,9 @@ import numpy as np
 from pydantic import Field
 
 from tailgate.base.errors import InputError, unknown
-from tailgate.core import (
-    Array,
-    Command,
-    Count,
-    Kind,
-    Model,
-    PositiveCount,
-    no_command,
-    param,
-)  # fmt: skip
-from tailgate.core.kinds import EFFECTS, KindName, Limits
-from tailgate.core.quantities import Bound, Bounded, Time, check_order
+from tailgate.core.kinds import EFFECTS, Kind, KindName, Limits
+from tailgate.core.nouns import Array, Command, Model, no_command, param
+from tailgate.core.quantities import Bound, Bounded, Count, PositiveCount, Time, check_order
 
 Knowledge = Literal["black", "grey", "white"]
 KNOWLEDGE: tuple[Knowledge, ...] = get_args(Knowledge)  # each sees what the one before it sees, and more

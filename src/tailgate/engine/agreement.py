@@ -5,16 +5,13 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from tailgate.base.errors import InputError
 from tailgate.engine.operations import Array
 from tailgate.engine.untraceable import Untraceable
-
-if TYPE_CHECKING:
-    from tailgate.core.loop import Loop
 
 T = TypeVar("T")
 TRIED, ROWS = 24, 64  # steps and episodes in which new code is compared with the plain loop
@@ -26,7 +23,15 @@ class Untraced(NamedTuple):
     why: str
 
 
-def check_open(loop: Loop) -> None:
+class Defended(Protocol):
+    """A loop, as far as it matters here."""
+
+    @property
+    def defence(self) -> object:
+        """The loop's defence."""
+
+
+def check_open(loop: Defended) -> None:
     """Raise TypeError for a defence that runs in another process or declares itself untraceable."""
     defence = loop.defence
     if why := getattr(defence, "opaque", "") or getattr(defence, "untraced", ""):
