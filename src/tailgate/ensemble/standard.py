@@ -25,6 +25,7 @@ from tailgate.evaluation.stats import proportion
 
 NAME = "standard-v0"
 SHOWN = 3  # scripts of a search that are reported
+TRIED, LISTED = 128, 4  # select episodes of every listed attack; listed attacks that are played on as many as the scripts found
 Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
 
 
@@ -82,19 +83,25 @@ def searched(job: Job, tell: Callable[[int, int, str, float], None] | None = Non
     """Run one search; return its best scripts, and the best attack that the suite lists, on the same select episodes."""
     arena = job.arena
     found = search(arena, EFFORTS[job.budget], job.seed, tell)
-    listed: list[dict[str, Any]] = []
-    for attack in job.listed:
-        try:
-            damage, score = arena.confirmed(attack, "select", 0, FINAL)
-        except NotApplicable:
-            continue
-        listed.append({"attack": attack, "damage": damage, "score": score})
-    best = max(listed, key=lambda one: float(one["score"]), default=None)
+    best = _strongest(arena, job.listed)
     families = [family.name for family in arena.space.families]
     return {
         "scenario": arena.scenario, "dose": arena.dose, "families": list(dict.fromkeys(families)), "listed": best,
         "found": [one._asdict() for one in found[:SHOWN]],
     }  # fmt: skip
+
+
+def _strongest(arena: Arena, attacks: Sequence[str]) -> dict[str, Any] | None:
+    """Return the attack that does most harm on select episodes: all are played on some, and the best of these on all."""
+    tried = {}
+    for attack in attacks:
+        try:
+            tried[attack] = arena.confirmed(attack, "select", 0, min(TRIED, FINAL))[1]
+        except NotApplicable:
+            continue
+    played = {attack: arena.confirmed(attack, "select", 0, FINAL) for attack in sorted(tried, key=lambda one: -tried[one])[:LISTED]}
+    best = max(played, key=lambda attack: played[attack][1], default=None)
+    return None if best is None else {"attack": best, "damage": played[best][0], "score": played[best][1]}
 
 
 def attack(
