@@ -156,7 +156,7 @@ def test_a_folder_is_scored_and_half_done_work_is_not(tmp_path: Path) -> None:
     some = play(SMALL, tmp_path, defences=["kf"])
     assert some != file and file.read_bytes() == before and {row["defence"] for row in read_rows(some)} == {"none", "kf"}
     file.write_bytes(packed(read_rows(some), file)[:-40])
-    with pytest.raises(InputError, match="cut"):
+    with pytest.raises(InputError, match="truncated"):
         read_rows(file)
 
 

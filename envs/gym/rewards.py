@@ -55,6 +55,7 @@ class Step:
         return np.asarray(np.max(self.model.error(self.frame.estimate.x, self.frame.truth), axis=1))
 
 
+@dataclass(frozen=True)
 class Payment:
     """Base class of the payment of a step. Register a subclass with `@register("reward", NAME)`, in any module of `envs`."""
 
