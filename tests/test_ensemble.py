@@ -163,3 +163,15 @@ def test_bad_input_is_refused_before_anything_is_played(change, message, capsys,
 def test_a_defence_without_a_meaning(capsys):
     assert main(["attack", "nobody", "--suite", "radar-v0"]) == 2 and "'nobody'" in capsys.readouterr().err
     assert main(["attack", "cra", "--suite", "quick-v0"]) == 2 and "one with a meaning in suite quick-v0" in capsys.readouterr().err
+
+
+def test_another_defence_of_the_same_name_is_searched_again(tmp_path, monkeypatch):
+    """The file of a finished search is that of the code that was attacked."""
+    text = "from tailgate.estimators import GatedKalman\n\n\nclass Mine(GatedKalman):\n    pass\n"
+    monkeypatch.syspath_prepend(str(tmp_path))
+    names = []
+    for extra in ("", "# changed\n"):
+        (tmp_path / "edited_defence.py").write_text(text + extra)
+        (job,) = standard.jobs_of(load_suite("radar-v0"), "edited_defence:Mine", ["radar-braking-v0"], [4], "quick", 0)
+        names.append(job.name)
+    assert names[0] != names[1]

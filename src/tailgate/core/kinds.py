@@ -152,7 +152,7 @@ class Delay(Effect):
 
     kind = Kind.DELAY
     valued = recorded = True
-    code, title, does, unit = "DELAY", "delay", "the receiver reads what was sent so many steps ago", "steps"
+    code, title, does, unit = "DELAY", "delay", "the receiver reads what was sent that many steps ago", "steps"
 
     def clip(self, limits: Limits, value: Array) -> Array:
         return np.clip(np.floor(value + 0.5), 1.0, float(limits.memory))
@@ -165,7 +165,7 @@ class Replay(Delay):
     """The receiver reads the last `value` samples before this replay, over and over."""
 
     kind = Kind.REPLAY
-    code, title, does = "REPLAY", "replay", "the receiver reads the last so many samples over and over"
+    code, title, does = "REPLAY", "replay", "the receiver reads the last samples, that many, over and over"
 
     def reads(self, sent: Array, value: Array, memory: Memory, recording: Recording) -> Array:
         span = value.astype(np.int64)
@@ -177,7 +177,7 @@ class NoiseJam(Effect):
 
     kind = Kind.NOISE_JAM
     valued = radiated = over_air = True
-    code, title, does, unit = "NOISE", "noise jamming", "noise of so much power reaches the receiver over the air", "W"
+    code, title, does, unit = "NOISE", "noise jamming", "noise of that power reaches the receiver over the air", "W"
 
     def most(self, limits: Limits) -> float:
         """Return the largest value that is granted."""
@@ -194,7 +194,7 @@ class EchoDelay(NoiseJam):
     """Over the air: the receiver's own signal comes back `value` metres too late."""
 
     kind = Kind.ECHO_DELAY
-    code, title, does, unit = "ECHO", "late echo", "the probe is answered late, so that the car ahead seems so much farther away", "m"
+    code, title, does, unit = "ECHO", "late echo", "the probe is answered late, so that the car ahead seems that much farther away", "m"
 
     def most(self, limits: Limits) -> float:
         return limits.delay

@@ -1,4 +1,4 @@
-"""A lossy link between a sensor and its readers, which nobody is told of: readings are lost, or come late.
+"""A lossy link between a sensor and its readers: readings are lost, or come late. Nobody knows of it in advance.
 
 Nobody attacks here. The receiver knows of a lost reading (`valid`), and its wire keeps the last value that arrived, as in an attack of kind
 dropout. It does not know that a reading is late.

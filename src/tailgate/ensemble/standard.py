@@ -11,12 +11,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tailgate.base import sizes
+from tailgate.base import sizes, sources
 from tailgate.base.errors import InputError, NotApplicable, unknown
 from tailgate.base.files import write_atomic
 from tailgate.base.pool import each
 from tailgate.base.reading import load_json
-from tailgate.base.version import VERSION
+from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite
 from tailgate.core.schema import digest
 from tailgate.ensemble.search import EFFORTS, FINAL, Arena, search
@@ -41,7 +41,8 @@ class Job(NamedTuple):
     def name(self) -> str:
         """The name of its file."""
         one = self.arena
-        return f"{one.scenario}-{'own' if one.dose is None else one.dose}-{digest([NAME, VERSION, *map(str, self)])}"
+        code = [sources.own(), Spec("defence", one.defence).digest]  # another defence or search under the same name is searched again
+        return f"{one.scenario}-{'own' if one.dose is None else one.dose}-{digest([NAME, *code, *map(str, self)])}"
 
 
 def jobs_of(suite: Suite, defence: str, scenarios: Sequence[str], doses: Sequence[int | None], budget: str, seed: int) -> list[Job]:
