@@ -4,6 +4,7 @@ import dataclasses
 import importlib
 import json
 import pickle
+import subprocess
 import sys
 import textwrap
 from dataclasses import dataclass
@@ -330,3 +331,17 @@ def test_a_class_that_cannot_be_made_is_refused_with_its_line(name, line, tmp_pa
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(InputError, match=rf"a class that can be made \(\w+Error: .*\(foreign_lines\.py, line {line}\)\)"):
         Spec("defence", f"foreign_lines:{name}").make()
+
+
+@pytest.mark.parametrize("heavy", ["torch", "cvxpy", "highway_env"])
+def test_components_are_listed_without_the_extras(heavy):
+    """The light install has none of them; only the learners need torch."""
+    code = f"""
+import sys
+sys.modules[{heavy!r}] = None
+from tailgate.core import registry
+for family in registry._MODULES:
+    if {heavy!r} != "torch" or family != "learner":
+        assert registry.entries(family), family
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -83,6 +83,6 @@ def discovered(package: str, *others: str) -> tuple[Callable[[str], object], Cal
     return get, names
 
 
-def loaded(package: str) -> list[ModuleType]:
-    """Import every module below a package that registers a component."""
-    return [import_module(module) for module in dict.fromkeys(components(package).values())]
+def loaded(package: str, family: str) -> list[ModuleType]:
+    """Import every module below a package that registers a component of a family; others may need more than is installed."""
+    return [import_module(module) for module in dict.fromkeys(module for (of, _), module in components(package).items() if of == family)]

@@ -129,7 +129,7 @@ def _at_home(family: Family, name: str) -> Entry | None:
 
 def built_in(family: Family) -> dict[str, Entry]:
     """Return the components that come with this package, by name; import nobody else's."""
-    loaded(_MODULES[family])
+    loaded(_MODULES[family], family)
     return {name: entry for name, entry in _entries[family].items() if entry.built_in}
 
 
