@@ -14,11 +14,13 @@ from tailgate.core.kinds import EFFECTS, Kind
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_suite
 from tailgate.engine.agreement import Untraced
+from tailgate.ensemble import members, networks, standard
 from tailgate.ensemble import search as searching
-from tailgate.ensemble import standard
-from tailgate.ensemble.battery import battery_of, played_plainly
+from tailgate.ensemble.battery import Played, Scripts, battery_of, played_plainly, remembered
+from tailgate.ensemble.members import Budget
+from tailgate.ensemble.networks import Learner, Race, learned, starts_of
 from tailgate.ensemble.search import Arena, Effort, search
-from tailgate.ensemble.space import FAMILIES, GENES
+from tailgate.ensemble.space import FAMILIES, GENES, NEVER
 from tailgate.play.metrics import METRICS
 from tailgate.play.trace import rollout
 
@@ -37,34 +39,90 @@ def arena(name, **changes):
     return dataclasses.replace(Arena("test", scenario, dose, defence, dict(threat), 5.0 if name == "network" else None), **changes)
 
 
-def repeated(rows, scripts):
+def played(place, scripts, plainly=False):
+    """Play scripts on the same episodes."""
+    count, loop, attack = len(scripts.length), place.loop, Scripts(len(scripts.phases) > 1)
     keys = draws.keys("tune", range(EPISODES))
-    return Keys(np.tile(keys.key, (scripts, 1)), np.tile(keys[1], scripts)), rows.take(np.repeat(np.arange(scripts), EPISODES))
+    many = Keys(np.tile(keys.key, (count, 1)), np.tile(keys[1], count))
+    memory = remembered(scripts.take(np.repeat(np.arange(count), EPISODES)), loop.model.agents)
+    if plainly:
+        return played_plainly(loop, attack, loop.brief, many, memory)
+    made = battery_of(loop, attack, loop.brief, remembered(scripts.take(np.arange(64) % count), loop.model.agents))
+    assert not isinstance(made, Untraced), made
+    return made.play(many, memory)
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.thin(2) if name in ("platoon", "network") else ()) for name in PLACES])
+def as_evaluated(place, text):
+    """Return the outcome of an attack as `evaluate` plays it, and if it attacked."""
+    spec = Spec("attack", text)
+    attack = spec.make()
+    trace = rollout(place.seat(spec.entry.knowledge, attack), attack, draws.keys("tune", range(EPISODES)))
+    gap = METRICS["min_gap"](trace) if place.loop.model.followers.any() else np.full(EPISODES, np.inf)
+    return Played(METRICS["crashed"](trace) > 0, gap, METRICS["max_error"](trace)), bool((trace.kind != 0).any())
+
+
+def assert_same(place, found, wanted, text):
+    """Collisions, smallest gaps and largest errors are equal to the last bit."""
+    assert np.array_equal(found.ended, wanted.ended), text
+    if place.loop.model.followers.any():
+        first = place.loop.plant.scene(place.loop.plan.plant, place.loop.start(draws.keys("tune", range(EPISODES))).plant)
+        before = np.min(first.gap[:, place.loop.model.followers], axis=1)
+        assert np.array_equal(np.minimum(found.gap, before), wanted.gap), text
+    else:
+        assert np.array_equal(found.error, wanted.error), text
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.thin(2) if name in ("platoon", "network") else ()) for name in PLACES]
+)
 def test_a_row_plays_what_its_text_says(name):
-    """Collisions, smallest gaps and largest errors are those of the script, to the last bit, for every family."""
+    """For every family of scripts."""
     place, rng = arena(name), np.random.default_rng(7)
-    space, count = place.space, 3 * len(place.space.families)
+    space, count, attacked = place.space, 3 * len(place.space.families), 0
     genomes = rng.random((count, len(GENES)))
     genomes[:, 0] = (np.arange(count) % len(space.families) + 0.5) / len(space.families)
-    battery = battery_of(place.loop, space.rows(genomes))
-    assert not isinstance(battery, Untraced), battery
-    played, follows, attacked = battery.play(*repeated(space.rows(genomes), count)), place.loop.model.followers, 0
+    outcome = played(place, space.scripts(genomes))
     for i, text in enumerate(map(space.text, genomes)):
-        attack = Spec("attack", text).make()
-        trace = rollout(place._loop(text), attack, draws.keys("tune", range(EPISODES)))
-        own = slice(i * EPISODES, (i + 1) * EPISODES)
-        assert np.array_equal(played.ended[own], METRICS["crashed"](trace) > 0), text
-        if follows.any():
-            before = np.min(trace.first["gap"][:, follows], axis=1)
-            assert np.array_equal(np.minimum(played.gap[own], before), METRICS["min_gap"](trace)), text
-        else:
-            assert np.array_equal(played.error[own], METRICS["max_error"](trace)), text
-        attacked += bool((trace.kind != 0).any())
+        wanted, on = as_evaluated(place, text)
+        assert_same(place, Played(*(part[i * EPISODES : (i + 1) * EPISODES] for part in outcome)), wanted, text)
+        attacked += on
     assert attacked > count / 3
     assert {f.name for f in space.families} == {f.name for f in FAMILIES if {f.kind, f.then or f.kind} <= _granted(place)}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.thin(2) if name in ("platoon", "network") else ()) for name in PLACES]
+)
+def test_a_row_plays_what_the_file_of_its_program_says(name, tmp_path):
+    """Both phases, whatever ends the first."""
+    place, rng = arena(name), np.random.default_rng(8)
+    space, count, attacked = place.programs, 2 * len(place.programs.families), 0
+    genomes = rng.random((count, space.genes))
+    genomes[:, 0] = (np.arange(count) % len(space.families) + 0.5) / len(space.families)
+    genomes[:, -1] *= 0.5
+    outcome = played(place, space.scripts(genomes))
+    for i, genome in enumerate(genomes):
+        wanted, on = as_evaluated(place, space.text(genome, tmp_path))
+        assert_same(place, Played(*(part[i * EPISODES : (i + 1) * EPISODES] for part in outcome)), wanted, space.label(genome))
+        attacked += on
+    assert attacked > count / 4
+
+
+def test_programs_around_scripts_hold_them():
+    """A script that changes its kind is split into two phases that do the same."""
+    place = arena("car")
+    genomes = np.random.default_rng(9).random((200, len(GENES)))
+    space, programs = place.space, place.programs
+    several = [
+        g
+        for g in genomes
+        if space.family(g).then and space.rows(g[None]).burst[0] == NEVER and space.budget - 1 > space.rows(g[None]).switch[0]
+    ]
+    assert several
+    first = programs.around(space, np.array(several), np.random.default_rng(0))
+    one, two = played(place, space.scripts(np.array(several))), played(place, programs.scripts(first))
+    near = np.abs(one.gap - two.gap) < 0.05
+    assert np.mean(near) > 0.8 and np.unique(np.round(one.gap, 2)).size > 10
 
 
 def _granted(place):
@@ -73,9 +131,8 @@ def _granted(place):
 
 def test_the_plain_loop_plays_the_same():
     place = arena("radar")
-    rows = place.space.rows(np.random.default_rng(1).random((40, len(GENES))))
-    batch = repeated(rows, 40)
-    fast, plain = battery_of(place.loop, rows).play(*batch), played_plainly(place.loop, *batch)
+    scripts = place.space.scripts(np.random.default_rng(1).random((40, len(GENES))))
+    fast, plain = played(place, scripts), played(place, scripts, plainly=True)
     assert all(np.array_equal(a, b) for a, b in zip(fast, plain, strict=True)) and plain.ended.any()
 
 
@@ -98,30 +155,88 @@ def test_a_search_finds_what_no_listed_attack_does():
     suite = load_suite("radar-v0")
     place = Arena(suite.name, "radar-braking-v0", 4, "chi2_kf", dict(suite.threat), suite.bound)
     told = []
-    best = search(place, Effort(512, 4), tell=lambda *words: told.append(words))
-    assert best[0].damage > 0.35 and best[0].script.startswith("echo_") and best[0].episodes == searching.FINAL
+    found = search(place, place.space, Effort(512, 4), tell=lambda *words: told.append(words))
+    best = place.best(map(place.space.text, found[:6]))
+    assert best[0].damage > 0.35 and best[0].attack.startswith("echo_") and best[0].episodes == searching.FINAL
     assert [one.score for one in best] == sorted((one.score for one in best), reverse=True)
     assert [words[:2] for words in told] == [(n, 4) for n in range(1, 5)]
-    assert search(place, Effort(512, 4)) == best != search(place, Effort(512, 4), seed=1)
+    assert np.array_equal(search(place, place.space, Effort(512, 4)), found)
+    assert not np.array_equal(search(place, place.space, Effort(512, 4), seed=1), found)
+
+
+def test_a_policy_is_played_as_its_file_says(tmp_path, monkeypatch):
+    """One program plays policies of any weights, to the bit of `evaluate`."""
+    place = arena("car")
+    monkeypatch.setattr(networks, "JUDGED", 64)
+    run, rng = Learner(place, "black", starts_of(place, "black", [], 0)[0], 8, 0), np.random.default_rng(0)
+    for _ in range(3):
+        theta = run.first + rng.standard_normal(run.first.size)
+        run.champion = (0.0, theta)
+        wanted, _ = as_evaluated(place, run.write(tmp_path, 0))
+        assert_same(place, run.played(theta, run.episodes_of("tune", 0, EPISODES)), wanted, "policy")
+
+
+def test_starts(monkeypatch):
+    """Rest, what a script does, at its size and on its wires, and published policies against the defence before others."""
+    monkeypatch.setattr(networks, "SHOWN", 8)
+    place, script = (
+        arena("car", threat={"kinds": ("dos_jam", "fdi"), "fdi_bound": 4.0}),
+        "fdi:trigger=near,threshold=40,value=-2,targets=[velocity]",
+    )
+    starts = starts_of(place, "black", [script], 0)
+    assert [start.name for start in starts[:2]] == ["rest", f"as {script}"] and "-chi2_kf-" in starts[2].name
+    assert {"fdi-*0.5:velocity", "fdi+", "dos_jam:position"} <= {mode.name for mode in starts[1].plan.action.modes}
+
+
+def test_policies_are_learned(tmp_path, monkeypatch):
+    """From rest alone, a network finds an echo that the gate lets through; the same seed finds the same network."""
+    suite = load_suite("radar-v0")
+    place = Arena(suite.name, "radar-braking-v0", 9, "kf", dict(suite.threat), suite.bound)
+    monkeypatch.setattr(networks, "JUDGED", 128)
+    race = Race(16, (networks.Phase(8, 16), networks.Phase(4, 32)))
+    texts = learned(place, "black", [], race, 0, tmp_path)
+    damage = place.confirmed(texts[0], "select", 0, 128)[0]
+    assert damage > place.confirmed("none", "select", 0, 128)[0] + 0.3
+    held = [(tmp_path / "policies" / name).read_bytes() for name in sorted(path.name for path in (tmp_path / "policies").iterdir())]
+    assert learned(place, "black", [], race, 0, tmp_path) == texts
+    assert held == [path.read_bytes() for path in sorted((tmp_path / "policies").iterdir())]
+    assert race.episodes(3, 1) == 3 * 128 + 3 * (8 * 16 * 16 + 128) + 2 * (4 * 32 * 16 + 128)
 
 
 @pytest.fixture
 def small(monkeypatch):
-    monkeypatch.setitem(searching.EFFORTS, "quick", SMALL)
-    for name, value in (("FINAL", 16), ("MORE", 8), ("KEPT", 8), ("FINALISTS", 1)):
+    monkeypatch.setitem(members.BUDGETS, "quick", Budget(SMALL, SMALL, 6, ((2, 8), (1, 8))))
+    monkeypatch.setattr(networks, "JUDGED", 64)
+    monkeypatch.setattr(members, "FINALISTS", 1)
+    for name, value in (("FINAL", 16), ("MORE", 8), ("KEPT", 8)):
         monkeypatch.setattr(searching, name, value)
     monkeypatch.setattr(standard, "FINAL", 16)
 
 
 def test_where_nobody_drives_an_error_is_damage(small):
     place = arena("network")
-    found = search(place, Effort(64, 1))
-    assert found and 0.0 <= found[0].damage <= 1.0
+    found = place.best([place.space.text(search(place, place.space, Effort(64, 1))[0])])
+    assert 0.0 <= found[0].damage <= 1.0
     with pytest.raises(InputError, match="bound: got None; expected an error that counts as damage"):
-        search(dataclasses.replace(place, bound=None), SMALL)
+        search(dataclasses.replace(place, bound=None), place.space, SMALL)
 
 
-WORDS = ["attack", "chi2_kf", "--suite", "radar-v0", "--scenario", "radar-braking-v0", "--dose", "4", "--budget", "quick", "--episodes", "20", "--workers", "1"]
+WORDS = [
+    "attack",
+    "chi2_kf",
+    "--suite",
+    "radar-v0",
+    "--scenario",
+    "radar-braking-v0",
+    "--dose",
+    "4",
+    "--budget",
+    "quick",
+    "--episodes",
+    "20",
+    "--workers",
+    "1",
+]
 
 
 def test_the_command(small, tmp_path, capsys, monkeypatch):
@@ -132,15 +247,24 @@ def test_the_command(small, tmp_path, capsys, monkeypatch):
     assert report["ensemble"] == "standard-v0" and cell["listed"]["attack"] in load_suite("radar-v0").attacks
     assert cell["found"]["episodes"] == 20 and cell["found"]["low"] <= cell["found"]["damage"] <= cell["found"]["high"]
     assert json.loads((tmp_path / "attack.json").read_text()) == report
-    (script,) = (tmp_path / "attacks.txt").read_text().splitlines()
-    assert script == cell["found"]["attack"]
-    evaluate = ["evaluate", "--suite", "radar-v0", "--scenario", "radar-braking-v0", "--dose", "4", "--defence", "chi2_kf", "--attack", script, "--seeds", "20"]
+    attacks = (tmp_path / "attacks.txt").read_text().splitlines()
+    own = {one["member"]: one for one in cell["members"]}
+    assert list(own) == ["scripts", "programs", "transfer", "networks", "grey networks", "white box"]
+    assert attacks == [one["attack"] for one in own.values()] and cell["found"]["attack"] in attacks
+    assert [one["knowledge"] for one in own.values()] == ["black"] * 4 + ["grey", "white"]
+    assert own["programs"]["attack"].startswith("program:path=") and own["networks"]["attack"].startswith("policy:path=")
+    evaluate = ["evaluate", "--suite", "radar-v0", "--scenario", "radar-braking-v0", "--dose", "4", "--defence", "chi2_kf", "--seeds", "20"]
+    evaluate += [word for attack in attacks for word in ("--attack", attack)]
     assert main([*evaluate, "--out", str(tmp_path / "again.jsonl")]) == 0
     rows = [json.loads(line) for line in (tmp_path / "again.jsonl").read_text().splitlines()]
-    assert sum(row["crashed"] for row in rows) / 20 == cell["found"]["damage"]
+    for one in own.values():
+        assert sum(row["crashed"] for row in rows if row["attack"] == one["attack"]) / 20 == one["damage"]
     monkeypatch.setattr(standard, "searched", lambda *_: pytest.fail("searched again"))
     assert main([*WORDS, "--out", str(tmp_path)]) == 0
-    assert "best script found" in (said := capsys.readouterr().out) and script in said.replace("\n", "")
+    assert "best of the suite" in capsys.readouterr().out
+    next((tmp_path / "policies").glob("*-grey-*.safetensors")).with_suffix(".json").unlink()
+    with pytest.raises(pytest.fail.Exception, match="searched again"):  # a file that is missing is made again
+        main([*WORDS, "--out", str(tmp_path)])
 
 
 @pytest.mark.parametrize(

@@ -260,27 +260,8 @@ class Learner(Search):
         return save_policy(path, self.network, header_of(self.seat, training))
 
     def imitate(self, shown: Demonstration) -> None:
-        """Make the first mean one that decides as shown (behaviour cloning: softmax regression through all layers, by Adam).
-
-        Only the largest output counts, so that the scale of the last layer is free. Its root mean square is set to 1: `sd` is then the size
-        of a change relative to it.
-        """
-        rng = np.random.default_rng([self.seed, 0, len(shown.action)])
-        theta = rng.standard_normal(self.shape.length)
-        for weight, bias in self.shape.layers(theta):  # views
-            weight /= np.sqrt(len(weight))
-            bias[:] = 0.0
-        first, second = np.zeros_like(theta), np.zeros_like(theta)
-        for t in range(1, IMITATION_ROUNDS + 1):
-            some = rng.integers(0, len(shown.action), IMITATION_BATCH)
-            slope = _slope(self.shape, theta, shown.observation[some].astype(np.float64), shown.action[some])
-            first, second = 0.9 * first + 0.1 * slope, 0.999 * second + 0.001 * slope**2
-            theta -= IMITATION_RATE * (first / (1.0 - 0.9**t)) / (np.sqrt(second / (1.0 - 0.999**t)) + 1e-8)
-        weight, bias = self.shape.layers(theta)[-1]
-        scale = np.sqrt(np.mean(np.concatenate([weight.ravel(), bias]) ** 2))
-        weight /= scale
-        bias /= scale
-        self.mean = theta
+        """Make the first mean one that decides as shown."""
+        self.mean = imitation(self.shape, shown, np.random.default_rng([self.seed, 0, len(shown.action)]))
 
     def episodes(self, layers: list[tuple[Array, Array]], members: int, keys: draws.Keys) -> tuple[Array, Array]:
         seat, seen = self.seat, None
@@ -301,6 +282,29 @@ class Learner(Search):
             over = over | outcome.terminated
             weight *= seat.reward.gamma
         return total, crashed
+
+
+def imitation(shape: Shape, shown: Demonstration, rng: np.random.Generator, batch: int = IMITATION_BATCH) -> Array:
+    """Return weights (length,) that decide as shown (behaviour cloning: softmax regression through all layers, by Adam).
+
+    Only the largest output counts, so that the scale of the last layer is free. Its root mean square is set to 1: the spread of a first
+    generation is then the size of a change relative to it.
+    """
+    theta = rng.standard_normal(shape.length)
+    for weight, bias in shape.layers(theta):  # views
+        weight /= np.sqrt(len(weight))
+        bias[:] = 0.0
+    first, second = np.zeros_like(theta), np.zeros_like(theta)
+    for t in range(1, IMITATION_ROUNDS + 1):
+        some = rng.integers(0, len(shown.action), batch)
+        slope = _slope(shape, theta, shown.observation[some].astype(np.float64), shown.action[some])
+        first, second = 0.9 * first + 0.1 * slope, 0.999 * second + 0.001 * slope**2
+        theta -= IMITATION_RATE * (first / (1.0 - 0.9**t)) / (np.sqrt(second / (1.0 - 0.999**t)) + 1e-8)
+    weight, bias = shape.layers(theta)[-1]
+    scale = np.sqrt(np.mean(np.concatenate([weight.ravel(), bias]) ** 2))
+    weight /= scale
+    bias /= scale
+    return theta
 
 
 def _slope(shape: Shape, theta: Array, seen: Array, action: Array) -> Array:

@@ -6,25 +6,26 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from tailgate.cli.shared import Commands, add_options, own_classes, say, show, table, working
-from tailgate.ensemble.search import EFFORTS
+from tailgate.cli.shared import Commands, add_options, own_classes, say, show, table, tell, working
+from tailgate.ensemble.members import BUDGETS
 
 
 def add(commands: Commands) -> None:
     """Add the command."""
     command = commands.add_parser(
-        "attack", help="find the scripts that do most harm to a defence, and compare them with a suite's attacks",
-        description="Search scripts of every granted family, on every set of wires, with every trigger, against a defence. The best one "
-        "of each scenario and dose is compared with the best attack that the suite lists, on fresh episodes.",
+        "attack", help="find the attacks that do most harm to a defence, and compare them with a suite's",
+        description="Attack a defence with the standard ensemble: searched scripts and programs, published and newly learned policies, and "
+        "attacks that know the defence. In each scenario, at each dose, the best of every member is compared with the best attack that the "
+        "suite lists, on fresh episodes.",
     )  # fmt: skip
     command.add_argument("defence", metavar="NAME", help="defence to attack; a class: module:Class, or bwrap/module:Class")
     command.add_argument("--suite", default="quick-v0", metavar="NAME", help="suite by name or YAML file (default: quick-v0)")
     add_options(command, "--scenario", "--dose")
-    command.add_argument("--budget", default="standard", metavar="SIZE", help=f"{' or '.join(EFFORTS)} (default: standard)")
+    command.add_argument("--budget", default="standard", metavar="SIZE", help=f"{' or '.join(BUDGETS)} (default: standard)")
     command.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the search (default 0)")
     command.add_argument("--episodes", type=int, default=400, metavar="N", help="report episodes per comparison (default 400)")
     command.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2); change no result")
-    command.add_argument("--out", metavar="DIR", help="write attack.json, attacks.txt, searches and rows here; resumes")
+    command.add_argument("--out", metavar="DIR", help="write attack.json, attacks.txt, programs, policies and rows here; resumes")
     add_options(command, "--json")
     command.set_defaults(run=_attack)
 
@@ -47,6 +48,7 @@ def _attack(options: argparse.Namespace) -> int:
         report = attack(
             load_suite(options.suite), options.defence, scenarios=options.scenario or (), doses=doses, budget=options.budget,
             seed=options.seed, episodes=options.episodes, workers=options.workers, out=out, progress=update,
+            announce=lambda seconds: tell(f"the searches take about {max(round(seconds / 60), 1)} min"),
         )  # fmt: skip
     if out is not None:
         write_atomic(out / "attacks.txt", "".join(f"{text}\n" for text in attacks_of(report)).encode())
@@ -56,21 +58,17 @@ def _attack(options: argparse.Namespace) -> int:
 
 def _print(report: dict[str, Any]) -> None:
     def figure(one: dict[str, Any] | None) -> str:
-        return "-" if one is None else f"{one['damage']:.1%} [{one['low']:.1%}, {one['high']:.1%}]"
+        return "-" if one is None or one["attack"] is None else f"{one['damage']:.1%} [{one['low']:.1%}, {one['high']:.1%}]"
 
-    lines, scripts = [], []
+    lines = []
     for cell in report["cells"]:
-        listed, found = cell["listed"], cell["found"]
-        dose = "own" if cell["dose"] is None else str(cell["dose"])
-        lines.append([cell["scenario"], dose, figure(listed), figure(found)])
-        if found:
-            scripts.append(f"{cell['scenario']}, dose {dose}: {found['attack']}")
+        name = f"{cell['scenario']}, dose {'own' if cell['dose'] is None else cell['dose']}"
+        lines.append([name, "best of the suite", "", figure(cell["listed"]), (cell["listed"] or {}).get("attack", "")])
+        lines += [["", one["member"], one["knowledge"], figure(one), one["attack"] or one["why"]] for one in cell["members"]]
     table(
-        ["scenario", "dose", "best listed attack", "best script found"], lines,
+        ["scenario", "member", "box", "damaged", "best attack"], lines,
         f"{report['defence']} in {report['suite']}: damaged episodes under {report['ensemble']}, budget {report['budget']}",
         f"{report['episodes']} report episodes; 95 % intervals",
     )  # fmt: skip
-    for line in scripts:
-        say(line, soft_wrap=True)
     better = [c for c in report["cells"] if c["found"] and c["listed"] and c["found"]["low"] > c["listed"]["high"]]
-    say(f"the search did more harm than every listed attack in {len(better)} of {len(report['cells'])} cells")
+    say(f"the ensemble did more harm than every listed attack in {len(better)} of {len(report['cells'])} cells")

@@ -1,35 +1,40 @@
-"""Many scripts at once: each row of a batch plays a script of its own, in one program.
+"""Many attacks at once, in one compiled program: a script or a program of its own in each row of a batch, or a policy of any weights.
 
-The engine traces the loop with scripts whose numbers are part of the state. So it compiles once, and plays whatever script comes.
+The engine traces the loop with an attack whose numbers are part of the state, or parameters of the call. So it compiles once, and plays
+whatever comes.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, cast
 
 import numpy as np
 
-from tailgate.base.pytree import leaves
-from tailgate.core import Array, Command, View
+from tailgate.base.pytree import leaves, map_leaves
+from tailgate.core import Array, Attack, Command, View
 from tailgate.core.draws import Draws, Keys
-from tailgate.core.kinds import EFFECTS
+from tailgate.core.kinds import EFFECTS, Kind
 from tailgate.core.loop import Loop
 from tailgate.core.threat import Brief
 from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
 from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, Program, State, traced
 from tailgate.engine.remembered import Remembered
-from tailgate.ensemble.space import TRIGGERS, Rows
+from tailgate.ensemble.space import TRIGGERS, Rows, Sequence
 
 STEPS = 32  # between two looks whether an episode is left
 NEAR, FAST, SLOW, CLOSING, BRAKING = (TRIGGERS.index(name) for name in ("near", "speed", "slow", "closing", "leader_braking"))
+_ONE = Keys(np.zeros((1, 3), np.uint64), np.zeros(1, np.uint32))
 
 
 class Memory(NamedTuple):
-    """The scripts and what they remember; every leaf has B first."""
+    """The scripts of B episodes and what they remember; every leaf has B first."""
 
-    rows: Rows
-    opened: Array  # (B,) bool: the trigger has fired
+    scripts: Sequence
+    phase: Array  # (B,) int64: the phase that is armed
+    attacked: Array  # (B,) int64: attacked steps of this phase
+    opened: Array  # (B,) bool: the phase's trigger has fired
     elapsed: Array  # (B,) int64: steps since it first fired
     lead_speed: Array  # (B, N) at the last look; -inf before the first
 
@@ -42,94 +47,124 @@ class Played(NamedTuple):
     error: Array  # largest error of an estimate
 
 
-class Scripts:
-    """An attack that plays a script of its own in each row."""
+class Decider(Protocol):
+    """An attack whose first memory is made elsewhere."""
 
-    def prepare(self, brief: Brief) -> Brief:
-        """Return the brief."""
-        return brief
+    def decide(self, plan: Any, memory: Any, view: View, draws: Draws) -> tuple[Any, Command]:
+        """Return the next memory and the commands."""
+
+
+@dataclass(frozen=True)
+class Scripts:
+    """An attack that plays a script of its own in each row, or a program of several phases."""
+
+    programs: bool = False  # programs have other code than scripts
 
     def decide(self, plan: Brief, memory: Memory, view: View, draws: Draws) -> tuple[Memory, Command]:
         """Return the next memory and the commands: what `tailgate.agents.scripts` sends under the same numbers."""
-        rows, scene, level = memory.rows, view.scene, memory.rows.threshold[:, None]
-        trigger = rows.trigger[:, None]
+        count, opened = memory.elapsed, memory.opened
+        rows = memory.scripts.phases[0]
+        if self.programs:
+            second = memory.phase == 1
+            rows = Rows(*(np.where(_like(second, new), new, old) for old, new in zip(*memory.scripts.phases, strict=True)))
+        scene, level, trigger = view.scene, rows.threshold[:, None], rows.trigger[:, None]
         holds = np.where(trigger == NEAR, scene.gap < level, trigger == 0)
         holds = np.where(trigger == FAST, scene.speed > level, holds)
         holds = np.where(trigger == SLOW, scene.speed < level, holds)
         holds = np.where(trigger == CLOSING, scene.speed - scene.lead_speed > level, holds)
         holds = np.where(trigger == BRAKING, (memory.lead_speed - scene.lead_speed) / plan.model.dt > level, holds)
         ready = (view.k >= rows.start) & (view.k >= plan.threat.onset)
-        opened = memory.opened | (ready & holds.any(axis=1))
-        count = memory.elapsed
+        opened = opened | (ready & holds.any(axis=1))
         on = opened & view.allowed & (count % (rows.burst + rows.pause) < rows.burst)
         if view.probed is not None:
             on = on & (view.probed.any(axis=1) | ~rows.hop)
         kind = np.where(count < rows.switch, rows.kind, rows.then)
         raw = (rows.base + rows.rate * (count + 1))[:, None, None]
-        value, limits = np.zeros(rows.target.shape), plan.limits
+        value, granted = np.zeros(rows.target.shape), {int(Kind[name.upper()]) for name in plan.threat.kinds}
         for number, effect in EFFECTS.items():
-            if effect.valued and np.any(_granted(plan) == number):
-                value = np.where((kind == number)[:, None, None], effect.clip(limits, raw + np.zeros(rows.target.shape)), value)
-        after = Memory(rows, opened, memory.elapsed + opened, np.array(scene.lead_speed))
+            if effect.valued and number in granted:
+                sent = effect.clip(plan.limits, raw + np.zeros(rows.target.shape))
+                value = np.where((kind == number)[:, None, None], sent, value)
         target = on[:, None, None] & rows.target
         hit = target.any(axis=(1, 2))
-        return after, Command(np.where(hit, kind, 0).astype(np.int8), target, np.where(target, value, 0.0))
+        command = Command(np.where(hit, kind, 0).astype(np.int8), target, np.where(target, value, 0.0))
+        attacked, phase, elapsed = memory.attacked, memory.phase, count + opened
+        if self.programs:  # the first phase ends after so many attacked steps
+            attacked = attacked + hit
+            over = (attacked >= memory.scripts.length) & (phase == 0)
+            phase, opened = phase + over, opened & ~over
+            attacked, elapsed = np.where(over, 0, attacked), np.where(over, 0, elapsed)
+        return Memory(memory.scripts, phase, attacked, opened, elapsed, np.array(scene.lead_speed)), command
 
 
-def _granted(plan: Brief) -> Array:
-    """Return the numbers of the kinds that are granted."""
-    from tailgate.core.kinds import Kind
+def _like(mask: Array, leaf: Array) -> Array:
+    """Return mask (B,) in the shape of a leaf (B, ...)."""
+    return mask.reshape(-1, *(1,) * (leaf.ndim - 1))
 
-    return np.array([int(Kind[name.upper()]) for name in plan.threat.kinds])
+
+def remembered(scripts: Sequence, agents: int) -> Memory:
+    """Return the memory of scripts (B,) at the start of their episodes."""
+    count = np.zeros(len(scripts.length), np.int64)
+    return Memory(scripts, count, count.copy(), count > 0, count.copy(), np.full((len(count), agents), -np.inf))
 
 
 class Battery:
-    """The program of a loop under scripts. Raises whatever its parts raise while they are traced."""
+    """The program of a loop under an attack, of which only the outcome is kept. Raises whatever its parts raise while they are traced."""
 
-    def __init__(self, loop: Loop, like: Rows) -> None:
+    def __init__(self, loop: Loop, attack: Decider, plan: object, like: object) -> None:
         check_open(loop)
-        self.loop, self.values = loop, None
-        one = begun(loop, Keys(np.zeros((1, 3), np.uint64), np.zeros(1, np.uint32)), like.take(np.zeros(1, np.int64)))
-        self.program = Program(traced(self._traced, one, {}))
+        self.loop, self.attack, self.plan, self.values = loop, attack, plan, None
+        self.program = Program(traced(self._traced, begun(loop, _ONE, like), {}))
+        self.programs = (self.program,)
 
-    @property
-    def programs(self) -> tuple[Program, ...]:
-        """The one program."""
-        return (self.program,)
-
-    def of(self, loop: Loop, values: list[Array]) -> Battery:
-        """Return the same program for a loop of other parameters."""
+    def of(self, loop: Loop, attack: Decider, plan: object, values: list[Array] | None) -> Battery:
+        """Return the same program for parameters of other values."""
         out = Battery.__new__(Battery)
-        out.loop, out.values, out.program = loop, values, self.program  # type: ignore[assignment]
+        out.program, out.programs = self.program, self.programs
+        out.loop, out.attack, out.plan, out.values = loop, attack, plan, values  # type: ignore[assignment]
         return out
 
     def _traced(self, held: Any, given: Any) -> tuple[Any, Any]:
-        return step(lifted(held["loop"].k, self.loop), held)
+        loop, attack, plan = lifted(held["loop"].k, (self.loop, self.attack, self.plan))
+        return step(loop, attack, plan, held)
 
-    def play(self, keys: Keys, rows: Rows) -> Played:
-        """Play an episode in each row."""
-        state = State(self.program, len(keys.key))
-        state.put(begun(self.loop, keys, rows))
-        call = Call(self.program, state, max(2, self.loop.horizon), self.values)
+    def play(self, keys: Keys, memory: object) -> Played:
+        """Play an episode in each row, from the memory of an attack at its start."""
+        return Episodes(self, keys, memory).play(self.values)
+
+
+class Episodes:
+    """Episodes at their start, which can be played again with other parameters."""
+
+    def __init__(self, battery: Battery, keys: Keys, memory: object) -> None:
+        self.battery, self.horizon = battery, battery.loop.horizon
+        self.state = State(battery.program, len(keys.key))
+        self.state.put(begun(battery.loop, keys, memory))
+        self._first = self.state.memory.copy()
+        self._call = Call(battery.program, self.state, max(2, self.horizon), battery.values)
+
+    def play(self, values: list[Array] | None) -> Played:
+        """Play all episodes under these parameters of the loop, the attack and its plan; None: those that were traced."""
+        state, call, done = self.state, self._call, 0
+        state.memory[...] = self._first
+        call.uniforms[...] = self.battery.program.uniforms(values)
         call.begin()
-        done = 0
-        while done < self.loop.horizon and not state.get_leaf("loop.ended").all():
-            call.play(min(STEPS, self.loop.horizon - done))
+        while done < self.horizon and not state.get_leaf("loop.ended").all():
+            call.play(min(STEPS, self.horizon - done))
             done += STEPS
         return Played(*(state.get_leaf(name) for name in ("loop.ended", "gap", "error")))
 
 
-def begun(loop: Loop, keys: Keys, rows: Rows) -> dict[str, Any]:
+def begun(loop: Loop, keys: Keys, memory: object) -> dict[str, Any]:
     """Return the state of episodes that begin."""
-    batch, agents = len(keys.key), loop.model.agents
-    memory = Memory(rows, np.zeros(batch, bool), np.zeros(batch, np.int64), np.full((batch, agents), -np.inf))
+    batch = len(keys.key)
     return {"loop": loop.start(keys), "memory": memory, "gap": np.full(batch, np.inf), "error": np.zeros(batch)}
 
 
-def step(loop: Loop, held: Any) -> tuple[Any, Any]:
+def step(loop: Loop, attack: Decider, plan: object, held: Any) -> tuple[Any, Any]:
     """Return the state one step later; an episode that has ended changes no more."""
     over = held["loop"].ended
-    state, memory, frame = loop.step(held["loop"], Scripts(), loop.brief, held["memory"])  # type: ignore[arg-type]
+    state, memory, frame = loop.step(held["loop"], cast("Attack", attack), plan, held["memory"])
     gap = np.min(np.where(loop.model.followers, frame.scene.gap, np.inf), axis=1)
     error = np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1)
     gap = np.where(over, held["gap"], np.minimum(held["gap"], gap))
@@ -137,25 +172,28 @@ def step(loop: Loop, held: Any) -> tuple[Any, Any]:
     return {"loop": state, "memory": memory, "gap": gap, "error": error}, {}
 
 
-def played_plainly(loop: Loop, keys: Keys, rows: Rows) -> Played:
+def played_plainly(loop: Loop, attack: Decider, plan: object, keys: Keys, memory: object) -> Played:
     """Play what `Battery.play` plays, in the plain loop: for defences that are not traced."""
-    held = begun(loop, keys, rows)
+    held = begun(loop, keys, memory)
     for _ in range(loop.horizon):
         if held["loop"].ended.all():
             break
-        held, _ = step(loop, held)
+        held, _ = step(loop, attack, plan, held)
     return Played(held["loop"].ended, held["gap"], held["error"])
 
 
 _made: Remembered[Battery] = Remembered()
 
 
-def battery_of(loop: Loop, rows: Rows) -> Battery | Untraced:
-    """Return the program of a loop under scripts, once it has been found equal to the plain loop; or why there is none."""
-    few = rows.take(np.arange(ROWS) % len(rows.kind))
+def battery_of(loop: Loop, attack: Decider, plan: object, few: object) -> Battery | Untraced:
+    """Return the program of a loop under an attack, once it has been found equal to the plain loop; or why there is none.
+
+    few: the memory of the attack at the start of ROWS episodes.
+    """
+    one = map_leaves(lambda leaf: leaf[:1], few)
     return _made.proved(
-        loop, lambda: begun(loop, _keys(1), rows.take(np.zeros(1, np.int64))), lambda: Battery(loop, rows),
-        lambda found, values: found.of(loop, values), lambda made: _difference(made, few),
+        (loop, attack, plan), lambda: begun(loop, _keys(1), one), lambda: Battery(loop, attack, plan, one),
+        lambda found, values: found.of(loop, attack, plan, values), lambda made: _difference(made, few),
     )  # fmt: skip
 
 
@@ -165,14 +203,14 @@ def _keys(batch: int) -> Keys:
     return draws.keys("tune", range(batch))
 
 
-def _difference(made: Battery, rows: Rows) -> str:
+def _difference(made: Battery, few: object) -> str:
     """Play some steps in both engines; return the first difference, or nothing."""
-    plain = begun(made.loop, _keys(ROWS), rows)
+    plain = begun(made.loop, _keys(ROWS), few)
     state = State(made.program, ROWS)
     state.put(plain)
     call = Call(made.program, state)
     for number in range(min(TRIED, made.loop.horizon)):
-        results, found = call(), raised(lambda: step(made.loop, plain))  # noqa: B023
+        results, found = call(), raised(lambda: step(made.loop, made.attack, made.plan, plain))  # noqa: B023
         if isinstance(found, str):
             return "" if not results["demands"].all() else f"step {number + 1}: {found}"
         plain = found[0]

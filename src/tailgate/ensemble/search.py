@@ -6,8 +6,9 @@ time, so that luck is not believed. The same seed finds the same scripts, whatev
 
 from __future__ import annotations
 
+import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -15,18 +16,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tailgate.base.errors import InputError
-from tailgate.core import Array, draws
+from tailgate.core import Array, Attack, draws
 from tailgate.core.draws import Keys
 from tailgate.core.loop import Loop
 from tailgate.core.registry import Spec
-from tailgate.engine.agreement import Untraced
-from tailgate.ensemble.battery import Played, battery_of, played_plainly
-from tailgate.ensemble.space import GENES, Rows, Space, road_of
+from tailgate.engine.agreement import ROWS, Untraced
+from tailgate.ensemble.battery import Played, Scripts, battery_of, played_plainly, remembered
+from tailgate.ensemble.programs import Programs
+from tailgate.ensemble.space import Sequence, Space, road_of
 from tailgate.evaluation.cells import Cell
 from tailgate.play.metrics import METRICS
 from tailgate.play.trace import rollout
 
 GRADED = 0.1  # weight of the graded score: it says which of two harmless scripts comes nearer to harm
+CLOSE, SHAPED = 6.0, 3.0  # gap that is near to a collision [m]; weight of being near in what a learner is paid
 FIRST, MORE = 16, 48  # episodes of every script of a generation, and more of its best
 PROMISING, KEPT = 8, 48  # one in so many scripts is played on more; scripts that are kept
 EACH = 8  # scripts of a family that are kept, at most: others may come from behind
@@ -38,19 +41,29 @@ AT_ONCE = 4096  # episodes of one agent side by side
 
 @dataclass(frozen=True)
 class Effort:
-    """The size of a search: scripts in a generation, for a system of one agent, and generations."""
+    """The size of a search of scripts: scripts in a generation, for a system of one agent, and generations."""
 
     scripts: int
     generations: int
 
+    def sizes(self, agents: int) -> tuple[int, int, int]:
+        """Return, for so many agents: scripts in a generation, those that meet more episodes, and those that are kept."""
+        count, kept = max(self.scripts // agents, 64), max(KEPT // agents, EACH)
+        return count, max(count // PROMISING, kept), kept
 
-EFFORTS = {"quick": Effort(512, 5), "standard": Effort(2048, 12)}
+    def episodes(self, agents: int) -> int:
+        """Return the episodes that a search plays."""
+        count, more, kept = self.sizes(agents)
+        return self.generations * (count * FIRST + (more + kept) * MORE)
+
+
+Tell = Callable[[int, int, str, float], None]  # generation, their count, the best attack so far, and its mean score
 
 
 class Found(NamedTuple):
-    """A script with the share of damaged episodes and the mean score in the last stage."""
+    """An attack with the share of damaged episodes and the mean score in the last stage."""
 
-    script: str
+    attack: str
     damage: float
     score: float
     episodes: int
@@ -71,20 +84,27 @@ class Arena:
         """Return the cell of an attack here."""
         return Cell(self.suite, self.scenario, self.dose, self.defence, attack, 1, threat=self.threat)
 
-    def _loop(self, attack: str) -> Loop:
-        spec, defence = Spec("attack", attack), Spec("defence", self.defence)
-        return self.cell(attack).place(spec.make(), spec.entry.knowledge).loop(defence.make(), defence.entry.uses)
+    def seat(self, knowledge: str, attack: Attack | None = None) -> Loop:
+        """Return the loop for attacks of this knowledge, or for one that says itself what it has to see."""
+        defence = Spec("defence", self.defence)
+        none: Attack = Spec("attack", "none").make()
+        return self.cell("none").place(none if attack is None else attack, knowledge).loop(defence.make(), defence.entry.uses)
 
     @cached_property
     def loop(self) -> Loop:
         """The loop, with an attacker who knows what the road shows."""
-        return self._loop("none")
+        return self.seat("black")
 
     @cached_property
     def space(self) -> Space:
         """The scripts that are granted here."""
         none = Spec("attack", "none").make()
         return Space(self.loop.brief, road_of(rollout(self.loop, none, draws.keys("tune", range(FIRST)))))
+
+    @cached_property
+    def programs(self) -> Programs:
+        """The programs of two phases that are granted here."""
+        return Programs(Space(self.space.brief, self.space.road, phase=True))
 
     @cached_property
     def start(self) -> float:
@@ -106,29 +126,62 @@ class Arena:
             raise InputError("suite: bound", None, f"an error that counts as damage: nobody drives in {self.scenario}")
         return played.ended | (played.error > self.bound), np.clip(played.error / self.bound, 0.0, 1.0)
 
-    def scores(self, rows: Rows, first: int, episodes: int) -> Array:
+    def scores(self, scripts: Sequence, first: int, episodes: int) -> Array:
         """Return the sum of scores (scripts,) of each script over the same episodes, from number `first` on."""
-        scripts, out = len(rows.kind), []
+        loop, agents, total = self.loop, self.loop.model.agents, len(scripts.length)
         keys = draws.keys("tune", range(first, first + episodes))
-        each = max(AT_ONCE // (self.loop.model.agents * episodes), 1)
-        battery = battery_of(self.loop, rows)
-        for begin in range(0, scripts, each):
-            some = rows.take(np.arange(begin, min(begin + each, scripts)))
-            count = len(some.kind)
-            many = Keys(np.tile(keys.key, (count, 1)), np.tile(keys[1], count))
-            one = some.take(np.repeat(np.arange(count), episodes))
-            played = played_plainly(self.loop, many, one) if isinstance(battery, Untraced) else battery.play(many, one)
-            damage, near = self.harm(played)
-            out.append((damage + GRADED * near).reshape(count, episodes).sum(axis=1))
+        each = max(AT_ONCE // (agents * episodes), 1)
+        attack = Scripts(len(scripts.phases) > 1)
+        battery = battery_of(loop, attack, loop.brief, remembered(scripts.take(np.arange(ROWS) % total), agents))
+        out = []
+        for begin in range(0, total, each):
+            some = np.arange(begin, min(begin + each, total))
+            many = Keys(np.tile(keys.key, (len(some), 1)), np.tile(keys[1], len(some)))
+            memory = remembered(scripts.take(np.repeat(some, episodes)), agents)
+            if isinstance(battery, Untraced):
+                played = played_plainly(loop, attack, loop.brief, many, memory)
+            else:
+                played = battery.play(many, memory)
+            out.append(self.score(played).reshape(len(some), episodes).sum(axis=1))
         return np.concatenate(out)
 
-    def confirmed(self, script: str, purpose: str, first: int, episodes: int) -> tuple[float, float]:
-        """Return the share of damaged episodes and the mean score of a script, as `evaluate` plays it."""
-        attack, loop = Spec("attack", script).make(), self._loop(script)
+    def speed(self) -> float:
+        """Return the episodes of scripts that this machine plays in a second, of one process."""
+        scripts = self.space.scripts(np.zeros((ROWS, self.space.genes)))
+        self.scores(scripts, 0, FIRST)  # compiles
+        begun = time.perf_counter()
+        self.scores(scripts, 0, FIRST)
+        return ROWS * FIRST / (time.perf_counter() - begun)
+
+    def score(self, played: Played) -> Array:
+        """Return the score (B,) of episodes: 1 for damage, and a little for coming near to it."""
+        damage, near = self.harm(played)
+        return np.asarray(damage + GRADED * near)
+
+    def payment(self, played: Played) -> Array:
+        """Return what a learner is paid (B,) for episodes: its score, and more the nearer each came to damage.
+
+        Damage alone says little of a small change of a policy; a gap that shrinks says it before there is a collision.
+        """
+        damage, near = self.harm(played)
+        if self.loop.model.followers.any():
+            near = np.exp(-np.maximum(played.gap, 0.0) / CLOSE)
+        return np.asarray(damage + SHAPED * near)
+
+    def confirmed(self, text: str, purpose: str, first: int, episodes: int) -> tuple[float, float]:
+        """Return the share of damaged episodes and the mean score of an attack, as `evaluate` plays it."""
+        spec = Spec("attack", text)
+        attack = spec.make()
+        loop = self.seat(spec.entry.knowledge, attack)
         trace = rollout(loop, attack, draws.keys(purpose, range(first, first + episodes)))
         gap = METRICS["min_gap"](trace) if loop.model.followers.any() else np.full(episodes, np.inf)
-        damage, near = self.harm(Played(METRICS["crashed"](trace) > 0, gap, METRICS["max_error"](trace)))
-        return float(np.mean(damage)), float(np.mean(damage + GRADED * near))
+        played = Played(METRICS["crashed"](trace) > 0, gap, METRICS["max_error"](trace))
+        return float(np.mean(self.harm(played)[0])), float(np.mean(self.score(played)))
+
+    def best(self, texts: Iterable[str]) -> list[Found]:
+        """Return attacks after the last stage, on select episodes that they all meet, the most harmful first."""
+        found = [Found(text, *self.confirmed(text, "select", 0, FINAL), FINAL) for text in dict.fromkeys(texts)]
+        return sorted(found, key=lambda one: -one.score)
 
 
 class Pool(NamedTuple):
@@ -143,66 +196,71 @@ class Pool(NamedTuple):
         """The mean score of each."""
         return np.asarray(self.total / self.episodes)
 
-    def kept(self, families: int) -> Pool:
-        """Return the best scripts, at most EACH of a family and KEPT in all."""
+    def kept(self, leads: list[int], families: int, most: int) -> Pool:
+        """Return the best attacks, at most EACH of the same families and `most` in all."""
         order = np.argsort(-self.mean, kind="stable")
-        family = np.minimum((self.genomes[order, GENES.index("family")] * families).astype(int), families - 1)
-        rank = np.array([np.count_nonzero(family[:i] == one) for i, one in enumerate(family)])
-        return Pool(*(part[order[rank < EACH][:KEPT]] for part in self))
+        family = np.minimum((self.genomes[order][:, leads] * families).astype(int), families - 1)
+        rank = np.array([np.count_nonzero((family[:i] == one).all(axis=1)) for i, one in enumerate(family)])
+        return Pool(*(part[order[rank < EACH][:most]] for part in self))
 
 
-def _children(pool: Pool, count: int, rng: np.random.Generator) -> Array:
+def _children(pool: Pool, count: int, leads: list[int], rng: np.random.Generator) -> Array:
     """Return genomes (count, genes): crossings of two of the pool, the better ones more often, with some genes changed."""
     size = len(pool.genomes)
     mother, father = (np.minimum((rng.random(count) ** 2 * size).astype(int), size - 1) for _ in range(2))
-    family = GENES.index("family")
-    cross = rng.random((count, len(GENES))) < 0.3
-    cross &= (pool.genomes[mother, family] == pool.genomes[father, family])[:, None]
+    cross = rng.random((count, pool.genomes.shape[1])) < 0.3
+    cross &= (pool.genomes[mother][:, leads] == pool.genomes[father][:, leads]).all(axis=1)[:, None]
     out = np.where(cross, pool.genomes[father], pool.genomes[mother])
     changed = rng.random(out.shape) < CHANGED
     small = out + STEP * rng.standard_normal(out.shape)
     jump = rng.random(out.shape)
     new = np.where(rng.random(out.shape) < 0.25, jump, np.abs(np.mod(small + 1.0, 2.0) - 1.0))  # reflected at 0 and 1
-    changed[:, family] = False
+    changed[:, leads] = False
     return np.asarray(np.clip(np.where(changed, new, out), 0.0, np.nextafter(1.0, 0.0)))
 
 
-def search(arena: Arena, effort: Effort, seed: int = 0, tell: Callable[[int, int, str, float], None] | None = None) -> list[Found]:
-    """Search the scripts that do most harm; return those of the last stage, the most harmful first.
+def search(
+    arena: Arena, space: Space | Programs, effort: Effort, seed: int = 0, *, first: Array | None = None, tell: Tell | None = None
+) -> Array:  # fmt: skip
+    """Search the attacks of a space that do most harm.
 
     Parameters
     ----------
     arena
         The defence, and where it is attacked.
+    space
+        Scripts or programs.
     seed
-        The same seed finds the same scripts.
+        The same seed finds the same attacks.
+    first
+        Genomes (P, genes) that join the first generation.
     tell
-        Called after each generation with its number, their count, the best script so far and its mean score.
+        Called after each generation with its number, their count, the best attack so far and its mean score.
 
     Returns
     -------
-    list of Found
-        Their figures come from episodes of their own, played as `evaluate` plays them. Empty where the threat model grants no script.
+    Array
+        Genomes (P, genes), the most harmful first. Empty where the threat model grants none.
     """
-    space = arena.space
-    if not space.families:
-        return []
-    rng = np.random.default_rng([seed, zlib.crc32(f"{arena.scenario}/{arena.dose}/{arena.defence}".encode())])
-    count, families = max(effort.scripts // arena.loop.model.agents, 64), len(space.families)
-    pool, family, episode = Pool(np.zeros((0, len(GENES))), np.zeros(0), np.zeros(0)), GENES.index("family"), 0
+    leads, families, genes = list(space.leads), len(space.families), space.genes
+    if not families:
+        return np.zeros((0, genes))
+    rng = np.random.default_rng([seed, zlib.crc32(f"{arena.scenario}/{arena.dose}/{arena.defence}".encode()), genes])
+    count, more, most = effort.sizes(arena.loop.model.agents)
+    pool, episode = Pool(np.zeros((0, genes)), np.zeros(0), np.zeros(0)), 0
     for generation in range(effort.generations):
-        fresh = rng.random((count if not generation else int(FRESH * count), len(GENES)))
-        fresh[:, family] = (np.arange(len(fresh)) % families + 0.5) / families  # every family alike
-        genomes = np.concatenate([fresh, _children(pool, count - len(fresh), rng)]) if generation else fresh
-        total = arena.scores(space.rows(genomes), episode, FIRST)
-        best = np.argsort(-total, kind="stable")[: max(count // PROMISING, KEPT)]
+        fresh = rng.random((count if not generation else int(FRESH * count), genes))
+        for place, lead in enumerate(leads):  # every family alike, and every pair
+            fresh[:, lead] = (np.arange(len(fresh)) // families**place % families + 0.5) / families
+        others = _children(pool, count - len(fresh), leads, rng) if generation else np.zeros((0, genes)) if first is None else first
+        genomes = np.concatenate([fresh, others])
+        total = arena.scores(space.scripts(genomes), episode, FIRST)
+        best = np.argsort(-total, kind="stable")[:more]
         joined = np.concatenate([pool.genomes, genomes[best]])
-        again = arena.scores(space.rows(joined), episode + FIRST, MORE)
+        again = arena.scores(space.scripts(joined), episode + FIRST, MORE)
         sums = np.concatenate([pool.total, total[best]]) + again
-        pool = Pool(joined, sums, np.concatenate([pool.episodes, np.full(len(best), FIRST)]) + MORE).kept(families)
+        pool = Pool(joined, sums, np.concatenate([pool.episodes, np.full(len(best), FIRST)]) + MORE).kept(leads, families, most)
         episode += FIRST + MORE
         if tell is not None:
-            tell(generation + 1, effort.generations, space.text(pool.genomes[0]), float(pool.mean[0]))
-    scripts = list(dict.fromkeys(space.text(genome) for genome in pool.genomes))[:FINALISTS]
-    found = [Found(script, *arena.confirmed(script, "select", 0, FINAL), FINAL) for script in scripts]
-    return sorted(found, key=lambda one: -one.score)
+            tell(generation + 1, effort.generations, space.label(pool.genomes[0]), float(pool.mean[0]))
+    return pool.genomes

@@ -9,10 +9,12 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from pathlib import Path
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from tailgate.base.pytree import map_leaves
 from tailgate.core import Array, Kind
 from tailgate.core.threat import Brief, receivers
 from tailgate.play.trace import Trace
@@ -43,9 +45,16 @@ class Rows(NamedTuple):
     pause: Array  # (B,) int64: steps between two bursts
     hop: Array  # (B,) bool: radiate only after a step in which the probe was heard
 
-    def take(self, places: Array) -> Rows:
-        """Return the rows at these places."""
-        return Rows(*(part[places] for part in self))
+
+class Sequence(NamedTuple):
+    """The scripts of B episodes: one phase or two, of which the second is armed when the first has attacked for `length` steps."""
+
+    phases: tuple[Rows, ...]
+    length: Array  # (B,) int64
+
+    def take(self, places: Array) -> Sequence:
+        """Return the scripts at these places."""
+        return map_leaves(lambda leaf: leaf[places], self)
 
 
 @dataclass(frozen=True)
@@ -114,16 +123,23 @@ def _log(gene: Array, low: float, high: float) -> Array:
 
 @dataclass(frozen=True)
 class Space:
-    """All scripts that a threat model grants in a scenario."""
+    """All scripts that a threat model grants in a scenario. A genome is a vector of `genes` numbers in [0, 1)."""
 
     brief: Brief
     road: dict[str, tuple[float, float]]
+    phase: bool = False  # the scripts are phases of a program, which know no bursts of a fixed length
+
+    genes: ClassVar[int] = len(GENES)
+    leads: ClassVar[tuple[int, ...]] = (0,)  # genes that say a family
 
     @cached_property
     def families(self) -> tuple[Family, ...]:
         """The families whose kinds are granted, and have a receiver."""
         granted, heard = {Kind[name.upper()] for name in self.brief.threat.kinds}, bool(receivers(self.brief).any())
-        return tuple(f for f in FAMILIES if {f.kind, f.then or f.kind} <= granted and (heard or not f.air))
+        return tuple(
+            f for f in FAMILIES
+            if {f.kind, f.then or f.kind} <= granted and (heard or not f.air) and not (self.phase and f.then)
+        )  # fmt: skip
 
     @cached_property
     def wires(self) -> tuple[tuple[str, ...], ...]:
@@ -149,7 +165,7 @@ class Space:
         most = self.brief.threat.budget
         return self.brief.horizon if most is None else min(most, self.brief.horizon)
 
-    def _reach(self, kind: Kind) -> tuple[float, float]:
+    def reach(self, kind: Kind) -> tuple[float, float]:
         """Return the smallest and the largest value of a kind, of one sign."""
         threat = self.brief.threat
         low, high = threat.jam_range
@@ -169,7 +185,7 @@ class Space:
         target = np.zeros((count, *brief.granted.shape), bool)
         for i, one in enumerate(self.families):
             here = family == i
-            low, high = self._reach(one.kind)
+            low, high = self.reach(one.kind)
             size = _log(gene["size"][here], low, high)
             signed = one.kind in (Kind.FDI, Kind.DOS_JAM)
             value = np.where(gene["sign"][here] < 0.5, -size, size) if signed else size
@@ -178,10 +194,11 @@ class Space:
                 fastest = max(2.0 * high / max(self.budget, 1), low)
                 growth = _log(gene["rate"][here], min(SMALL * high, 0.5 * fastest), fastest)
                 rate[here] = _short(np.where(gene["rate_sign"][here] < 0.5, -growth, growth) if signed else growth)
-            target[here] = receivers(brief) if one.air else brief.granted
+            target[here] = self._aired if one.air else brief.granted
+        free = ~np.array([f.air for f in self.families])[family] | (not self.phase)  # a phase over the air hits all that a receiver reads
         for i, names in enumerate(self.wires):
             if names:
-                target[wires == i] &= np.array([name in names for name in brief.model.wires])
+                target[(wires == i) & free] &= np.array([name in names for name in brief.model.wires])
         for i, number in enumerate(self.agents):
             if number is not None:
                 target[agent == i] &= (np.arange(brief.granted.shape[0]) == number)[:, None]
@@ -193,7 +210,7 @@ class Space:
         threat = brief.threat
         last = brief.horizon if threat.end is None else min(threat.end, brief.horizon)
         first = threat.onset + _pick(gene["when"], max(last - threat.onset + 1, 1))
-        many = (gene["bursts"] < 0.4) & (self.budget > 1)
+        many = (gene["bursts"] < 0.4) & (self.budget > 1) & (not self.phase)
         kinds, thens = (np.array([int(held) for held in each]) for each in
                         ((f.kind for f in self.families), (f.then or f.kind for f in self.families)))  # fmt: skip
         return Rows(
@@ -202,14 +219,35 @@ class Space:
             trigger, threshold, np.where(trigger == 0, first, 1),
             np.where(many, np.round(_log(gene["burst"], 1.0, max(self.budget / 2, 1.0))).astype(np.int64), NEVER),
             np.where(many, np.round(_log(gene["pause"], 1.0, LONG)).astype(np.int64), 0),
-            (gene["hop"] < 0.3) & np.array([f.air for f in self.families])[family],
+            (gene["hop"] < 0.3) & np.array([f.air for f in self.families])[family] & (not self.phase),
         )  # fmt: skip
 
-    def text(self, genome: Array) -> str:
-        """Return the text of one script."""
-        row = self.rows(genome[None])
+    @property
+    def _aired(self) -> Array:
+        """Return the wires (N, w) that are hit over the air: a phase of a program names the first that a receiver reads."""
+        heard = receivers(self.brief)
+        return np.asarray(heard & (np.cumsum(heard, axis=1) == 1)) if self.phase else heard
+
+    def scripts(self, genomes: Array) -> Sequence:
+        """Return the scripts of genomes (B, genes)."""
+        return Sequence((self.rows(genomes),), np.full(len(genomes), NEVER))
+
+    def label(self, genome: Array) -> str:
+        """Return a short text of one script."""
+        return self.text(genome)
+
+    def family(self, genome: Array) -> Family:
+        """Return the family of one script."""
+        return self.families[int(_pick(genome[:1], len(self.families))[0])]
+
+    def sets(self, genome: Array) -> tuple[tuple[str, ...], int | None]:
+        """Return the wires that one script names, and its agent; empty and None: all that are granted."""
         gene = dict(zip(GENES, genome[:, None], strict=True))
-        family = self.families[int(_pick(gene["family"], len(self.families))[0])]
+        return self.wires[int(_pick(gene["targets"], len(self.wires))[0])], self.agents[int(_pick(gene["agent"], len(self.agents))[0])]
+
+    def text(self, genome: Array, folder: Path | None = None) -> str:
+        """Return the text of one script, as on the command line."""
+        row, family = self.rows(genome[None]), self.family(genome)
         words = [family.fixed] if family.fixed else []
         base, rate = (f"{held[0]:.4g}" for held in (row.base, row.rate))
         if family.ramp:
@@ -222,9 +260,10 @@ class Space:
             words.append(f"inject={row.switch[0]}")
         if row.hop[0]:
             words.append("hop=true")
-        if names := self.wires[int(_pick(gene["targets"], len(self.wires))[0])]:
+        names, agent = self.sets(genome)
+        if names:
             words.append(f"targets=[{','.join(names)}]")
-        if (agent := self.agents[int(_pick(gene["agent"], len(self.agents))[0])]) is not None:
+        if agent is not None:
             words.append(f"agents=[{agent}]")
         name = TRIGGERS[int(row.trigger[0])]
         words += [f"start_step={row.start[0]}"] if name == "time" else [f"trigger={name}", f"threshold={row.threshold[0]:.4g}"]

@@ -1,12 +1,14 @@
-"""The standard attack ensemble against a defence: searched scripts, in every scenario of a suite at every dose.
+"""The standard attack ensemble against a defence, in every scenario of a suite at every dose.
 
-Each search is kept in a file of its own, so that an interrupted run goes on. The report compares the best script found with the best
-attack that the suite lists, both chosen on select episodes, and both played on report episodes.
+Each search is kept in a file of its own, so that an interrupted run goes on. The report compares the best attack of every member with the
+best one that the suite lists. All are chosen on select episodes, and played on report episodes.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
+import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,12 +21,13 @@ from tailgate.base.reading import load_json
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite
 from tailgate.core.schema import digest
-from tailgate.ensemble.search import EFFORTS, FINAL, Arena, search
+from tailgate.ensemble.members import BUDGETS, Hunt, harvest
+from tailgate.ensemble.search import FINAL, Arena
 from tailgate.evaluation.cells import Cell, run
 from tailgate.evaluation.stats import proportion
 
 NAME = "standard-v0"
-SHOWN = 3  # scripts of a search that are reported
+SHOWN = 3  # attacks of a member that are kept
 TRIED, LISTED = 128, 4  # select episodes of every listed attack; listed attacks that are played on as many as the scripts found
 Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
 
@@ -53,8 +56,8 @@ def jobs_of(suite: Suite, defence: str, scenarios: Sequence[str], doses: Sequenc
     InputError
         For an unknown budget, scenario or dose, and for a defence that has no meaning in any of the scenarios.
     """
-    if budget not in EFFORTS:
-        raise unknown("--budget", budget, EFFORTS)
+    if budget not in BUDGETS:
+        raise unknown("--budget", budget, BUDGETS)
     if seed < 0:
         raise InputError("--seed", seed, "a whole number, not below 0")
     for name in scenarios:
@@ -80,15 +83,23 @@ def jobs_of(suite: Suite, defence: str, scenarios: Sequence[str], doses: Sequenc
     return played
 
 
-def searched(job: Job, tell: Callable[[int, int, str, float], None] | None = None) -> dict[str, Any]:
-    """Run one search; return its best scripts, and the best attack that the suite lists, on the same select episodes."""
+def expected(jobs: Sequence[Job], workers: int) -> float:
+    """Return the seconds that searches take, as the speed of the first one's scripts says."""
+    arena = jobs[0].arena
+    steps = sum(BUDGETS[job.budget].episodes(job.arena.loop.model.agents) * job.arena.loop.horizon for job in jobs)
+    return steps / (arena.speed() * arena.loop.horizon) / min(workers, len(jobs))
+
+
+def searched(job: Job, folder: Path, tell: Callable[[int, int, str, float], None] | None = None) -> dict[str, Any]:
+    """Run one search; return what every member found, and the best attack that the suite lists, on the same select episodes.
+
+    folder: where files of attacks are written.
+    """
     arena = job.arena
-    found = search(arena, EFFORTS[job.budget], job.seed, tell)
-    best = _strongest(arena, job.listed)
-    families = [family.name for family in arena.space.families]
+    members = harvest(Hunt(arena, BUDGETS[job.budget], job.seed, folder, tell))
     return {
-        "scenario": arena.scenario, "dose": arena.dose, "families": list(dict.fromkeys(families)), "listed": best,
-        "found": [one._asdict() for one in found[:SHOWN]],
+        "scenario": arena.scenario, "dose": arena.dose, "listed": _strongest(arena, job.listed),
+        "members": [one._asdict() | {"found": [found._asdict() for found in one.found[:SHOWN]]} for one in members],
     }  # fmt: skip
 
 
@@ -108,8 +119,9 @@ def _strongest(arena: Arena, attacks: Sequence[str]) -> dict[str, Any] | None:
 def attack(
     suite: Suite, defence: str, *, scenarios: Sequence[str] = (), doses: Sequence[int | None] = (), budget: str = "standard", seed: int = 0,
     episodes: int = 400, workers: int = 1, out: Path | None = None, progress: Progress | None = None,
+    announce: Callable[[float], None] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Attack a defence with the standard ensemble.
+    """Attack a defence with all members of the standard ensemble.
 
     Parameters
     ----------
@@ -117,17 +129,20 @@ def attack(
         What is attacked; all scenarios and doses of the suite unless given.
     budget
         Size of the searches: quick or standard.
+    announce
+        Called with the seconds that the searches will take, about, before they begin.
     episodes
         Report episodes of each comparison.
     workers
         Processes; they change no result.
     out
-        Folder of finished searches and rows. The same call goes on after an interrupt.
+        Folder of finished searches, rows, and the files of programs and policies. The same call goes on after an interrupt. By default
+        these files are removed in the end.
 
     Returns
     -------
     dict
-        `cells`: for each scenario and dose the best listed attack and the best script found, with damage and its 95 % interval.
+        `cells`: for each scenario and dose the best listed attack and the best of each member, with damage and its 95 % interval.
 
     Raises
     ------
@@ -138,49 +153,69 @@ def attack(
     sizes.check("episodes", episodes)
     update = progress or (lambda *_: None)
     jobs = jobs_of(suite, defence, scenarios, doses, budget, seed)
-    done = {i: held for i, job in enumerate(jobs) if (held := _kept(job, out)) is not None}
-    left = [i for i in range(len(jobs)) if i not in done]
-    update("searches", len(done), len(jobs), "")
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory())) if out is None else out
+        done = {i: held for i, job in enumerate(jobs) if (held := _kept(job, out)) is not None}
+        left = [i for i in range(len(jobs)) if i not in done]
+        if announce is not None and left:
+            announce(expected([jobs[i] for i in left], workers))
+        update("searches", len(done), len(jobs), "")
 
-    def finish(number: int, result: dict[str, Any]) -> None:
-        done[number] = result
-        if out is not None:
-            write_atomic(out / "searches" / f"{jobs[number].name}.json", json.dumps(result, indent=1).encode() + b"\n")
-        best = result["found"][0] if result["found"] else None
-        update("searches", len(done), len(jobs), f"{result['scenario']}: {best['damage']:.0%} by {best['script']}" if best else "")
+        def finish(number: int, result: dict[str, Any]) -> None:
+            done[number] = result
+            if out is not None:
+                write_atomic(_file(jobs[number], out), json.dumps(result, indent=1).encode() + b"\n")
+            best = _best(result)
+            update("searches", len(done), len(jobs), f"{result['scenario']}: {best['damage']:.0%} by {best['attack']}" if best else "")
 
-    if workers > 1 and len(left) > 1:
-        for number, result in each(searched, [(jobs[i],) for i in left], workers):
-            finish(left[number], result)
-    else:
-        for i in left:
-            label = f"{jobs[i].arena.scenario}, dose {jobs[i].arena.dose}"
-            finish(i, searched(jobs[i], lambda n, of, script, mean, label=label: update(label, n, of, script)))  # type: ignore[misc]
-    cells = [
-        Cell(suite.name, one["scenario"], one["dose"], defence, text, episodes, threat=dict(suite.granted))
-        for one in (done[i] for i in range(len(jobs)))
-        for text in dict.fromkeys([*([one["listed"]["attack"]] if one["listed"] else []), *(f["script"] for f in one["found"][:1])])
-    ]  # fmt: skip
-    rows = run(cells, out / "rows.jsonl" if out is not None else None, workers, lambda n, of: update("report", n, of, ""))
+        if workers > 1 and len(left) > 1:
+            for number, result in each(searched, [(jobs[i], folder) for i in left], workers):
+                finish(left[number], result)
+        else:
+            for i in left:
+                label = f"{jobs[i].arena.scenario}, dose {jobs[i].arena.dose}"
+                finish(i, searched(jobs[i], folder, lambda n, of, text, mean, label=label: update(label, n, of, text)))  # type: ignore[misc]
+        results = [done[i] for i in range(len(jobs))]
+        cells = [
+            Cell(suite.name, one["scenario"], one["dose"], defence, text, episodes, threat=dict(suite.granted))
+            for one in results for text in dict.fromkeys(_chosen(one))
+        ]  # fmt: skip
+        rows = run(cells, out / "rows.jsonl" if out is not None else None, workers, lambda n, of: update("report", n, of, ""))
     report = {
         "ensemble": NAME, "suite": suite.name, "defence": defence, "budget": budget, "seed": seed, "episodes": episodes,
-        "cells": [_compared(done[i], rows, suite.bound) for i in range(len(jobs))],
+        "cells": [_compared(result, rows, suite.bound) for result in results],
     }  # fmt: skip
     if out is not None:
         write_atomic(out / "attack.json", json.dumps(report, indent=1).encode() + b"\n")
     return report
 
 
+def _file(job: Job, out: Path) -> Path:
+    return out / "searches" / f"{job.name}.json"
+
+
+def _best(result: dict[str, Any]) -> dict[str, Any] | None:
+    """Return the attack of all members that did most harm on select episodes."""
+    return max((one["found"][0] for one in result["members"] if one["found"]), key=lambda found: found["score"], default=None)
+
+
+def _chosen(result: dict[str, Any]) -> list[str]:
+    """Return the attacks that are reported: the best listed one, and the best of each member."""
+    listed = [result["listed"]["attack"]] if result["listed"] else []
+    return listed + [one["found"][0]["attack"] for one in result["members"] if one["found"]]
+
+
 def _kept(job: Job, out: Path | None) -> dict[str, Any] | None:
     """Return the result of a search that an earlier run finished."""
-    path = None if out is None else out / "searches" / f"{job.name}.json"
+    path = None if out is None else _file(job, out)
     if path is None or not path.is_file():
         return None
     try:
         held = load_json(path)
     except (OSError, ValueError) as error:
         raise InputError("--out", str(path), f"the result of a search; remove the file to search again ({error})") from None
-    return held if isinstance(held, dict) else None
+    files = [Path(text.partition("path=")[2]) for text in _chosen(held) if text.startswith(("program:", "policy:"))]
+    return held if all(file.is_file() for file in files) else None  # a file that was removed is made again
 
 
 def _compared(result: dict[str, Any], rows: list[dict[str, Any]], bound: float | None) -> dict[str, Any]:
@@ -195,14 +230,19 @@ def _compared(result: dict[str, Any], rows: list[dict[str, Any]], bound: float |
         share = proportion(hits, len(own))
         return {"attack": text, "damage": share.value, "low": share.low, "high": share.high, "episodes": len(own)}
 
-    listed, found = result["listed"], result["found"]
+    members = [
+        {"member": one["member"], "knowledge": one["knowledge"], "why": one["why"]}
+        | (damage(one["found"][0]["attack"] if one["found"] else None) or {"attack": None})
+        for one in result["members"]
+    ]  # fmt: skip
+    best = _best(result)
     return {
-        "scenario": result["scenario"], "dose": result["dose"], "families": result["families"],
-        "listed": damage(listed and listed["attack"]), "found": damage(found[0]["script"] if found else None), "others": found[1:],
+        "scenario": result["scenario"], "dose": result["dose"], "listed": damage(result["listed"]["attack"] if result["listed"] else None),
+        "found": damage(best["attack"] if best else None), "members": members,
     }  # fmt: skip
 
 
 def attacks_of(report: dict[str, Any]) -> list[str]:
-    """Return the scripts that were found, each once, as `tailgate evaluate --attack` takes them."""
-    return list(dict.fromkeys(cell["found"]["attack"] for cell in report["cells"] if cell["found"]))
+    """Return the attacks that were found, each once, as `tailgate evaluate --attack` takes them."""
+    return list(dict.fromkeys(one["attack"] for cell in report["cells"] for one in cell["members"] if one["attack"]))
 

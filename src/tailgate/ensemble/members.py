@@ -1,0 +1,145 @@
+"""The members of the standard attack ensemble: each looks for attacks in its own way, and may begin where another ended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from tailgate.base.errors import InputError, NotApplicable
+from tailgate.core import Array
+from tailgate.core.registry import entries
+from tailgate.ensemble.networks import PUBLISHED, Phase, Race, learned, transferred
+from tailgate.ensemble.search import FINALISTS, Arena, Effort, Found, Tell, search
+
+IMITATED = 2  # scripts that networks imitate at the start
+STARTS = 1 + IMITATED + PUBLISHED  # of a race of policies, at most
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The size of each member's search."""
+
+    scripts: Effort
+    programs: Effort
+    population: int  # of a generation of policies
+    phases: tuple[tuple[int, int], ...]  # of the race of policies: generations, and episodes of each member
+
+    @property
+    def race(self) -> Race:
+        """The search of policies."""
+        return Race(self.population, tuple(Phase(*phase) for phase in self.phases))
+
+    def episodes(self, agents: int) -> int:
+        """Return the episodes that all members play in a scenario, about."""
+        return self.scripts.episodes(agents) + self.programs.episodes(agents) + 2 * self.race.episodes(STARTS, agents)
+
+
+BUDGETS = {
+    "quick": Budget(Effort(512, 5), Effort(256, 4), 32, ((20, 32), (20, 64))),
+    "standard": Budget(Effort(2048, 12), Effort(1024, 10), 64, ((40, 32), (40, 64), (60, 128))),
+}
+
+
+@dataclass
+class Hunt:
+    """A search of all members against a defence in one scenario at one dose."""
+
+    arena: Arena
+    budget: Budget
+    seed: int
+    folder: Path  # of the files that attacks need
+    tell: Tell | None = None
+    genomes: Array | None = None  # of the best scripts
+    found: dict[str, list[Found]] = field(default_factory=dict)  # by member
+
+    @property
+    def best_scripts(self) -> list[str]:
+        """The best scripts so far, each of another family."""
+        out: dict[str, str] = {}
+        for one in self.found.get("scripts", []):
+            out.setdefault(one.attack.partition(":")[0], one.attack)
+        return list(out.values())[:IMITATED]
+
+
+def _scripts(hunt: Hunt) -> list[str]:
+    """Search scripts of every family."""
+    hunt.genomes = search(hunt.arena, hunt.arena.space, hunt.budget.scripts, hunt.seed, tell=hunt.tell)
+    return list(dict.fromkeys(map(hunt.arena.space.text, hunt.genomes)))[:FINALISTS]
+
+
+def _programs(hunt: Hunt) -> list[str]:
+    """Search programs of two phases, at first around the best scripts."""
+    arena, space = hunt.arena, hunt.arena.programs
+    rng = np.random.default_rng([hunt.seed, 2])
+    first = space.around(arena.space, hunt.genomes, rng) if hunt.genomes is not None and space.families else None
+    found = search(arena, space, hunt.budget.programs, hunt.seed, first=first, tell=hunt.tell)
+    return [space.text(genome, hunt.folder) for genome in found[:FINALISTS]]
+
+
+def _policies(hunt: Hunt, knowledge: str) -> list[str]:
+    return learned(hunt.arena, knowledge, hunt.best_scripts, hunt.budget.race, hunt.seed, hunt.folder, hunt.tell)
+
+
+def _transfer(hunt: Hunt) -> list[str]:
+    """Play the published policies that have a meaning here."""
+    return [f"zoo:name={policy.name}" for policy, _ in transferred(hunt.arena)]
+
+
+def _white_box(hunt: Hunt) -> list[str]:
+    """Play the attacks that know the defence's state, as they come."""
+    out = []
+    for name, entry in entries("attack").items():
+        if entry.knowledge == "white":
+            try:
+                attack = entry.cls()
+                attack.prepare(hunt.arena.seat("white", attack).brief)
+            except (NotApplicable, InputError):
+                continue
+            out.append(name)
+    return out
+
+
+class Member(NamedTuple):
+    """A way to find attacks, and what the attacks know."""
+
+    name: str
+    knowledge: str
+    find: Callable[[Hunt], list[str]]  # attacks as on the command line
+
+
+MEMBERS = (
+    Member("scripts", "black", _scripts),
+    Member("programs", "black", _programs),
+    Member("transfer", "black", _transfer),
+    Member("networks", "black", lambda hunt: _policies(hunt, "black")),
+    Member("grey networks", "grey", lambda hunt: _policies(hunt, "grey")),
+    Member("white box", "white", _white_box),
+)
+
+
+class Harvest(NamedTuple):
+    """The attacks that a member found, the most harmful first; or the reason why it has no meaning here."""
+
+    member: str
+    knowledge: str
+    found: list[Found]
+    why: str = ""
+
+
+def harvest(hunt: Hunt) -> list[Harvest]:
+    """Let every member search; return what each found."""
+    out = []
+    for member in MEMBERS:
+        found, why = [], ""
+        try:
+            found = hunt.arena.best(member.find(hunt))
+            why = "" if found else "the threat model grants nothing for it"
+        except NotApplicable as error:
+            why = str(error)
+        hunt.found[member.name] = found
+        out.append(Harvest(member.name, member.knowledge, found, why))
+    return out
