@@ -37,25 +37,31 @@ LONGEST = 500  # characters of options in an error, at most
 T = TypeVar("T")
 
 
-@dataclass(frozen=True)
-class Header:
-    """The JSON file of a policy."""
+@dataclass(frozen=True, kw_only=True)
+class Seen:
+    """The part of a policy's file that says what it sees, what it may do, and how it was made."""
 
-    format: Literal["tailgate-policy-1"]
-    tensors: str
-    sha256: str
-    layers: PositiveCount
     action: ActionSpec
     observation: tuple[str, ...]
     knowledge: Literal["black", "grey", "white"]
     sees_measurement: bool = False
     frames: PositiveCount = 1
     agents: PositiveCount | None = None  # agents of the system that it was trained on; older files have none
+    training: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Header(Seen):
+    """The JSON file of a network."""
+
+    format: Literal["tailgate-policy-1"]
+    tensors: str
+    sha256: str
+    layers: PositiveCount
     squashed: bool = False  # the outputs go through tanh
     masked: bool = False  # chooses among the actions that the channel would accept
     recurrent: bool = False  # an LSTM comes before the perceptron
     greedy: bool = False  # its outputs are no distribution that actions could be drawn from
-    training: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
 def choose(
@@ -170,7 +176,7 @@ class PolicyAttack:
             shown = ", ".join(differing[:SOME]) + (f" and {len(differing) - SOME} more" if len(differing) > SOME else "")
             wanted = f"the observation of this scenario and threat model{_trained_with(header)}"
             raise InputError(f"policy {self.path.name}", f"observation {shown}", wanted)
-        outputs = network.weights[-1].shape[1]
+        outputs = network.outputs
         if outputs != action.size:
             wanted = f"{action.size}, as environment.action={header.action.action} has under this threat model{_trained_with(header)}"
             raise InputError(f"policy {self.path.name}", f"a network with {outputs} outputs", wanted)

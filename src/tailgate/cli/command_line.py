@@ -18,8 +18,8 @@ from tailgate.base.interrupts import Ending, orderly
 
 EXIT_INPUT = 2
 COMMANDS = (
-    "train", "tune", "selfplay", "ensemble", "evaluate", "timing", "dose", "transfer", "zoo", "calibrate", "leaderboard", "log", "replay",
-    "reproduce", "trust", "bench", "list", "explain",
+    "train", "tune", "selfplay", "ensemble", "distil", "evaluate", "timing", "dose", "transfer", "zoo", "calibrate", "leaderboard", "log",
+    "replay", "reproduce", "trust", "bench", "list", "explain",
 )  # fmt: skip
 
 

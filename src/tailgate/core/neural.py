@@ -86,6 +86,11 @@ class Network:
     lstm: Lstm | None = None
     squashed: bool = False
 
+    @property
+    def outputs(self) -> int:
+        """The number of outputs."""
+        return len(self.biases[-1])
+
     def __call__(self, observation: Array) -> Array:
         """Return the output (B, o) for an input (B, d): logits or values of discrete actions, or the mean of a continuous action."""
         x: Array = np.asarray(observation, np.float64)

@@ -40,6 +40,7 @@ from tailgate.envs.gym.rewards import Reward
 HIDDEN, REST = 16, 0.5  # width of the hidden layer; how much a network leans towards rest at first
 SHOWN = 128  # episodes of the script that a network imitates, for a system of one agent
 SPREAD = 0.3  # of the first generation: of the size of a network's weights, and by itself where they are 0
+RAMP = (1, 3, 9)  # steps of a ramp whose sizes a policy may send
 COPIED = 1024  # decisions of a script in a step of its imitation
 JUDGED = 1024  # episodes that decide which starts go on, for a system of one agent
 FEWEST = 8  # episodes that a member plays, at least
@@ -170,8 +171,9 @@ def action_of(arena: Arena, scripts: Sequence[str]) -> ActionSpec:
     shares, single = {1.0}, False
     for script in scripts:
         made = Spec("attack", script).make()
-        bound = delay if script.startswith("echo") else value
-        sizes = [abs(getattr(made, name)) for name in ("value", "base", "delay") if isinstance(getattr(made, name, None), float)]
+        bound, base, rate = delay if script.startswith("echo") else value, getattr(made, "base", None), getattr(made, "rate", 0.0)
+        sizes = [abs(held) for name in ("value", "delay") if isinstance(held := getattr(made, name, None), float)]
+        sizes += [] if base is None else [abs(base + rate * step) for step in RAMP]
         shares |= {float(f"{size / bound:.3g}") for size in sizes if bound and 0.01 < size / bound < 0.95}
         single = single or bool(made.targets)
     sized = {"fdi", "echo_delay"} & set(threat.kinds)
