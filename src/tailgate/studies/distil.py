@@ -110,7 +110,7 @@ def arena_of(text: str, scenario: str | None = None, defence: str | None = None,
 
 
 def fitted(shown: Shown, leaves: int) -> Split | Leaf:
-    """Return the tree of at most so many leaves that is right most often, each action counting alike.
+    """Return the tree of at most this many leaves that is right most often, each action counting alike.
 
     Raises ImportError without scikit-learn.
     """
