@@ -177,9 +177,9 @@ def test_bad_input_is_exit_code_2_and_one_line(run: Run, tmp_path: Path, argumen
 
 
 def test_a_run_is_compared_also_where_nobody_can_look_into_the_defence(run: Run) -> None:
-    """The default white-box attack needs an innovation, which `none` has not: it is left out, with the reason. `none` is a name here."""
+    """The preset's white-box attack needs an innovation, which `none` has not: it is left out, with the reason. `none` is a name here."""
     code, out, said = run(
-        "train", "defence=none", "steps=600", "learner=cem", "cem={population: 4, episodes: 5, hidden: []}", "environment.interval=20",
+        "train", "--config", "gusty", "defence=none", "steps=600", "learner=cem", "cem={population: 4, episodes: 5, hidden: []}", "environment.interval=20",
         "teacher=null", "rivals=[]", "episodes=4", "others=[]", "workers=1", "tensorboard=false", "--json",
     )  # fmt: skip
     assert code == 0, said

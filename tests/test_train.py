@@ -116,7 +116,7 @@ def test_the_learner_rests_first() -> None:
 
 
 SMALL_RUN = (
-    "steps=1280", "ppo={envs: 16, rollout: 40, batch_size: 160, epochs: 1}", "episodes=12", "rivals=['fdi:trigger=near,threshold=30']", "others=[]",
+    "--config", "gusty", "name=quickstart", "steps=1280", "ppo={envs: 16, rollout: 40, batch_size: 160, epochs: 1}", "episodes=12", "rivals=['fdi:trigger=near,threshold=30']", "others=[]",
     "white_box=[]", "tensorboard=false", "workers=1",
 )  # fmt: skip
 COMMAND = (sys.executable, "-m", "tailgate", "train")
@@ -184,7 +184,7 @@ def test_a_finished_comparison_is_not_played_again(
 
 def test_learners_may_share_what_was_played(here: Path, small_run: tuple[str, ...]) -> None:
     """Rows lie with the first of them; the report of the second is no comparison that its own run could go on from."""
-    configs = [train.load_config(None, [*small_run, f"name={name}"]) for name in ("one", "two")]
+    configs = [train.load_config("gusty", [*small_run[2:], f"name={name}"]) for name in ("one", "two")]
     policies = [train.train(config, lambda *_: None) for config in configs]
     scripts = comparison.play_scripts(configs[0], [path for found in policies for path in found])
     reports = [comparison.compare(config, found, scripts=scripts) for config, found in zip(configs, policies, strict=True)]

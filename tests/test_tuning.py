@@ -36,7 +36,7 @@ def _search(directory: Path, trials: int, name: str = "small", **changes: Any) -
         f"out={directory}", f"name={name}", "cem.population=4", "steps=600", "outcome=rmse_position", "scenario=thesis-ch5-v0",
         "defence=dkf", "threat={kinds: [fdi], fdi_bound: 5.0}", "environment={action: mode, value: 5.0, reward: error, error_scale: 30.0, interval: 10}",
     ]  # fmt: skip
-    search = tuning.make_search("quickstart", overrides, trials, learner="cem", episodes=3)
+    search = tuning.make_search("gusty", overrides, trials, learner="cem", episodes=3)
     return dataclasses.replace(search, **({"space": SPACE} | changes))
 
 
@@ -143,7 +143,7 @@ def test_a_policy_that_diverges_costs_its_trial_only(tmp_path: Path) -> None:
         f"out={tmp_path}", "name=wild", "steps=1200", "outcome=rmse_position", "scenario=thesis-ch5-v0", "defence=dkf", "threat={kinds: [fdi], fdi_bound: 5.0}",
         "environment={action: continuous, reward: error, error_scale: 30.0, interval: 10}", "ppo={envs: 16, rollout: 16, batch_size: 64, epochs: 2, hidden: [4]}",
     ]  # fmt: skip
-    search = dataclasses.replace(tuning.make_search("quickstart", overrides, 4, episodes=3), space={"ppo.learning_rate": {"choices": [1e30, 1e-3]}})
+    search = dataclasses.replace(tuning.make_search("gusty", overrides, 4, episodes=3), space={"ppo.learning_rate": {"choices": [1e30, 1e-3]}})
     report = tuning.tune(search)
     failed = [entry for entry in report["trials"] if entry["state"] == "fail"]
     assert 0 < len(failed) < 4 and all("ppo.learning_rate" in e["reason"] and e["parameters"]["ppo.learning_rate"] == 1e30 for e in failed)
@@ -151,7 +151,7 @@ def test_a_policy_that_diverges_costs_its_trial_only(tmp_path: Path) -> None:
     assert tuning.tune(search) == report
 
 
-@pytest.mark.parametrize("preset", ["car-following", "quickstart"])
+@pytest.mark.parametrize("preset", ["car-following", "gusty"])
 def test_what_was_tuned_is_what_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: str) -> None:
     """A teacher that is the best of the rivals has them in each trial; best.yaml is the preset with the values found, to the last field."""
     seen: list[Any] = []

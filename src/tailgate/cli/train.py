@@ -113,7 +113,23 @@ def _page(config: TrainConfig, report: dict[str, Any]) -> Path:
         point for seed in training_seeds(config)
         for point in curve_of(config.directory / f"curve-{seed}.json")["curve"]
     ]  # fmt: skip
-    rows = read_rows(config.directory / ROWS)
+    rows, folder = read_rows(config.directory / ROWS), config.directory / "page"
     title = f"{config.name}: {config.defence} under attack"
     drawn = curve if all(point["crash"] is not None for point in curve) else None
-    return build_page(rows, config.directory / "page", title=title, curve=drawn, headline=headline(report))
+    return build_page(rows, folder, title=title, curve=drawn, headline=headline(report), learned=_learned(config, report, rows))
+
+
+def _learned(config: TrainConfig, report: dict[str, Any], rows: list[dict[str, Any]]) -> dict[str, Any] | None:
+    """Return what the page shows of the first policy, with a replay of its worst episode beside the page."""
+    from tailgate.replay.page import write_page
+    from tailgate.replay.replay import Filter, choose, play
+    from tailgate.site.learned import learned
+
+    policy = report["policies"][0]
+    own = [row for row in rows if row["attack"] == policy and row["defence"] == config.defence]
+    found = learned(Path(policy), config.scenario, config.defence, dict(config.threat), own, config.directory)
+    if found is None:
+        return None
+    wanted = Filter(defence=config.defence, attack=policy, scenario=config.scenario)
+    page = write_page(play(choose(own, wanted).row, wanted), config.directory / "page" / "replay.html", policy)
+    return found | {"replay": page.name}

@@ -179,11 +179,13 @@ def _curve(data: Sequence[Data] | None) -> Data | None:
 
 
 def build(
-    rows: Sequence[Data], out: Path, *, title: str | None = None, curve: list[Data] | None = None, headline: Data | None = None
-) -> Path:
+    rows: Sequence[Data], out: Path, *, title: str | None = None, curve: list[Data] | None = None, headline: Data | None = None,
+    learned: Data | None = None,
+) -> Path:  # fmt: skip
     """Write out/index.html and out/summary.json from evaluation rows, and return the path of the page.
 
     curve: [{steps, seed, crash}] of a training run; headline: {text, items: [{label, value, low, high, note}]}; shares are 0 to 1.
+    learned: what `learned.learned` returns.
     Raises InputError for no rows, and for a curve or headline that cannot be drawn.
     """
     if not rows:
@@ -201,7 +203,7 @@ def build(
     pages = Pages(title)
     columns = [(key, text, METRICS[key].__doc__ or "") for key, text in COLUMNS]
     page = pages.render(
-        "rows_page.html", columns=columns, facts=facts, headline=_headline(headline), curve=_curve(curve),
+        "rows_page.html", columns=columns, facts=facts, headline=_headline(headline), curve=_curve(curve), learned=learned,
         sections=[_section(key, *group, words) for key, group in groups.items()],
         families=[("Defences", _cards(words, "defence")), ("Attacks", _cards(words, "attack"))],
     )  # fmt: skip

@@ -18,6 +18,8 @@ from tailgate.agents.policy.rules import Leaf, Split, Tree, save_rules
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
 from tailgate.core import Array, draws
+from tailgate.core.kinds import EFFECTS
+from tailgate.envs.gym.actions import Mode
 from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.envs.gym.batches import framed, side_by_side
 from tailgate.envs.gym.observations import SCALES
@@ -117,9 +119,9 @@ def fitted(shown: Shown, leaves: int) -> Split | Leaf:
     try:
         from sklearn.tree import DecisionTreeClassifier
     except ImportError as error:
-        raise ImportError("scikit-learn is missing: pip install 'tailgate[distil]'") from error
-    if len(np.unique(shown.action)) == 1:
-        return Leaf(int(shown.action[0]))
+        raise ImportError("scikit-learn is missing: pip install 'tailgate[train]'") from error
+    if len(np.unique(shown.action)) < 2:
+        return Leaf(int(shown.action[0]) if len(shown.action) else 0)
     made = DecisionTreeClassifier(max_leaf_nodes=leaves, class_weight="balanced", random_state=0)
     made.fit(shown.observation.astype(np.float32), shown.action)
     held, classes = made.tree_, made.classes_
@@ -136,7 +138,7 @@ def fitted(shown: Shown, leaves: int) -> Split | Leaf:
 
 
 def words(node: Split | Leaf, names: tuple[str, ...], actions: tuple[str, ...], depth: int = 0) -> list[str]:
-    """Return rules as lines of text, with physical units where a component has one."""
+    """Return rules as lines of text, with physical units where a component has one. actions: in words."""
     pad = "  " * depth
     if isinstance(node, Leaf):
         return [f"{pad}{actions[node.action]}"]
@@ -148,6 +150,16 @@ def words(node: Split | Leaf, names: tuple[str, ...], actions: tuple[str, ...], 
         f"{pad}if {name} > {value}:", *words(node.above, names, actions, depth + 1),
         f"{pad}else:", *words(node.below, names, actions, depth + 1),
     ]  # fmt: skip
+
+
+def meaning(mode: Mode) -> str:
+    """Return an action in words: its name, with the value that it sends."""
+    effect = EFFECTS.get(int(mode.kind))
+    if effect is None or not effect.valued:
+        return mode.name
+    sent = mode.value[mode.target.any(axis=0)]
+    values = " / ".join(dict.fromkeys(f"{value:.3g}" for value in sent.tolist()))
+    return f"{mode.name}, {values}"
 
 
 def distil(
@@ -210,7 +222,7 @@ def distil(
     found = paired_difference(own.astype(float), theirs.astype(float), share=True)
     return {
         "policy": text, "scenario": arena.scenario, "defence": arena.defence, "file": str(file), "leaves": chosen.leaves,
-        "rules": words(chosen.tree, names, actions), "episodes": episodes,
+        "rules": words(chosen.tree, names, tuple(map(meaning, arena.plan.action.modes))), "episodes": episodes,
         "trees": [{"leaves": one.leaves, "damage": one.damage} for one in trees],
         "damage": float(own.mean()), "policy_damage": float(theirs.mean()),
         "difference": {"value": found.value, "low": found.low, "high": found.high},
