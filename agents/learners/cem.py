@@ -49,7 +49,7 @@ Share = Annotated[float, Field(gt=0, le=1)]
 
 @dataclass(frozen=True)
 class Config:
-    """Hyper-parameters of the cross-entropy method, tuned on training seeds of the quickstart scenario."""
+    """Hyper-parameters of the cross-entropy method, tuned on training seeds of the preset `gusty`."""
 
     population: Rows = param(128, "policies in a generation")
     episodes: Rows = param(24, "episodes that each policy of a generation plays, the same for all")

@@ -28,7 +28,7 @@ IMITATION_ENTROPY = 0.003  # an exact imitation would explore nothing
 
 @dataclass(frozen=True)
 class Config:
-    """Hyper-parameters, tuned on training seeds of the quickstart scenario."""
+    """Hyper-parameters, tuned on training seeds of the preset `gusty`."""
 
     name: ClassVar[str] = "ppo"
 

@@ -38,7 +38,8 @@ def learned(policy: Path, scenario: str, defence: str, threat: dict[str, Any], r
     trace = rollout(loop, who.policy, draws.keys("report", seeds))
     shown = [i for i in range(len(seeds)) if (trace.kind[: trace.length[i], i] != 0).any()][:EPISODES]
     try:
-        found: Data | None = distil(text, folder / "rules.json", scenario=scenario, defence=defence, threat=threat, loss=LOSS, episodes=max(len(rows), 1))
+        file, episodes = folder / "rules.json", max(len(rows), 1)
+        found: Data | None = distil(text, file, scenario=scenario, defence=defence, threat=threat, loss=LOSS, episodes=episodes)
     except InputError:  # a policy with a memory, or with values that it chooses freely
         found = None
     return {
