@@ -202,8 +202,8 @@ def check_wires(law: Law, target: Array, brief: Brief, where: str) -> None:
     if not isinstance(law, PerWire):
         law.check(brief, where)
         return
-    for name, part in law.laws:
-        part.check(brief, f"{where}.{name}")
+    for name, held in law.laws:
+        held.check(brief, f"{where}.{name}")
     wires = brief.model.wires
     for name in law.wires:
         if name not in wires:

@@ -17,7 +17,7 @@ from tailgate.engine.operations import COMPARISONS, FLOAT, Array
 from tailgate.engine.program import Trace
 
 try:
-    import torch
+    import torch as torch  # for those who differentiate
 except ImportError as error:
     raise ImportError("derivatives of a loop need PyTorch: pip install 'tailgate[train]'") from error
 

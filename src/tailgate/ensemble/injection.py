@@ -50,13 +50,6 @@ class Injection:
         """The operations of a step."""
         return self._form.operations
 
-    @property
-    def steps(self) -> int:
-        """The steps of a schedule."""
-        threat, horizon = self.loop.threat, self.loop.horizon
-        last = horizon if threat.end is None else min(threat.end, horizon)
-        return max(last - max(threat.onset, self.trigger.start) + 1, 1)
-
     def _begun(self, keys: Keys) -> dict[str, Any]:
         state, batch = self.loop.start(keys), len(keys.key)
         held = {"loop": state, "trigger": idle(batch, self.loop.model.agents)}
