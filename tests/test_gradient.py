@@ -14,7 +14,7 @@ from tailgate.cli import main
 from tailgate.core import Kind, draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
-from tailgate.ensemble.schedule import Schedule, Scheduled, steps_of
+from tailgate.ensemble.schedule import Schedule, Scheduled, schedule_of, steps_of
 from tailgate.ensemble.search import Arena, Found
 from tailgate.play.trace import rollout
 
@@ -45,6 +45,11 @@ def drawn(loop, seed, size=1.0):
     return Schedule({"name": "time"}, values, np.random.default_rng([10, seed]).random(len(values)) < 0.6)
 
 
+def for_each(schedule, episodes):
+    """The same schedule in each episode."""
+    return Schedule(schedule.trigger, *(np.repeat(part[None], episodes, axis=0) for part in (schedule.values, schedule.chosen)))
+
+
 def figures(loop, trace):
     """The smallest gap of a follower and the largest error, (K, B)."""
     gap = np.min(np.where(loop.model.followers, trace.signals["gap"], np.inf), axis=2)
@@ -58,7 +63,7 @@ def test_the_torch_form_has_the_bits_of_the_loop(name):
     schedule, keys = drawn(loop, 0), draws.keys("train", range(3))
     path = Injection(loop, Trigger()).play(keys, torch.tensor(schedule.sent, requires_grad=True))
     assert path.error.requires_grad
-    trace = rollout(loop, Scheduled(schedule._replace(**{x: np.stack([getattr(schedule, x)] * 3) for x in ("values", "chosen")})), keys, plain=True)
+    trace = rollout(loop, Scheduled(for_each(schedule, 3)), keys, plain=True)
     assert (trace.kind == int(Kind.FDI)).any()
     for got, wanted in zip((path.gap, path.error), figures(loop, trace), strict=True):
         count = min(len(got), len(wanted))
@@ -140,6 +145,21 @@ def test_the_exported_program_plays_the_schedule(tmp_path):
             assert np.array_equal(got.detach().numpy()[path.live], wanted[: len(path.live)][path.live])
 
 
+@pytest.mark.parametrize("text", [
+    "fdi:value=-2.5,start_step=30", "fdi:value=2,targets=[velocity],trigger=near,threshold=91,burst=3,pause=4",
+    "fdi_ramp:base=0.5,rate=-0.25,limit=3,trigger=closing,threshold=1,length=9", "fdi:value=1,signs=2",
+])  # fmt: skip
+def test_a_script_as_a_schedule_sends_the_same(text):
+    loop, keys = loop_of("gusty-stop-and-go-v0", "kf", 160, onset=20, budget=12), draws.keys("train", range(3))
+    script = rollout(loop, Spec("attack", text).make(), keys, plain=True)
+    schedule = rollout(loop, Scheduled(for_each(schedule_of(text, loop.brief), 3)), keys, plain=True)
+    assert (script.kind != 0).any()
+    assert np.array_equal(script.kind, schedule.kind)
+    assert np.array_equal(script.signals["value"], schedule.signals["value"])
+    with pytest.raises(InputError, match="false data"):
+        schedule_of("dos_hold", loop.brief)
+
+
 def test_a_table_for_each_agent(tmp_path):
     loop = loop_of("platoon-gusty-v0", "dkf", 12, agents=(1, 2))
     schedule = drawn(loop, 4)
@@ -195,8 +215,7 @@ def test_hindsight_is_no_less_than_the_schedule_itself():
     values = np.full((steps_of(loop.brief), *loop.brief.granted.shape), -3.0) * loop.brief.granted
     start = Schedule({"name": "near", "threshold": 8.5}, values, np.arange(len(values)) < 20)
     keys = draws.keys("train", range(12))
-    own = Schedule(start.trigger, *(np.repeat(x[None], 12, axis=0) for x in (start.values, start.chosen)))
-    hit = np.mean(rollout(loop, Scheduled(own), keys, plain=True).signals["collided"].any(axis=0))
+    hit = np.mean(rollout(loop, Scheduled(for_each(start, 12)), keys, plain=True).signals["collided"].any(axis=0))
     assert 0.0 < hit <= hindsight(ARENA, start, 12, 2, "train")
 
 

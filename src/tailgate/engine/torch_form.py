@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from tailgate.engine.compiled import Code
 from tailgate.engine.evaluation import Evaluation, multiplied
 from tailgate.engine.graph import Graph, Node, computed
 from tailgate.engine.operations import COMPARISONS, FLOAT, Array
@@ -21,6 +22,7 @@ try:
 except ImportError as error:
     raise ImportError("derivatives of a loop need PyTorch: pip install 'tailgate[train]'") from error
 
+LONG = 100  # nodes of a routine that is worth machine code
 Rule = Callable[[torch.Tensor], tuple[torch.Tensor, ...]]
 _FLAT = {"floor", "ceil", "trunc", "rint", "not", "bits", *COMPARISONS}  # operations with derivative 0
 _DERIVATIVES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {"log": torch.reciprocal}  # of routines on the bits of a number
@@ -67,6 +69,7 @@ class TorchEvaluation(Evaluation):
     def __init__(self, graph: Graph, roots: Sequence[Node]) -> None:
         super().__init__(graph, roots)
         self._parts_of: dict[int, tuple[torch.Tensor, Sequence[torch.Tensor]]] = {}
+        self._codes: dict[int, Code] = {}
 
     def compute(self, node: Node, args: Sequence[Any]) -> Any:
         """Return the value of an operation: a tensor if one of its arguments is one and the operation has a derivative."""
@@ -128,13 +131,21 @@ class TorchEvaluation(Evaluation):
         return held[1]
 
     def call(self, routine: Any, args: Sequence[Any]) -> list[Any]:
-        """Return the results of a routine; some have a derivative that its operations on bits do not show."""
-        derivative = _DERIVATIVES.get(routine.name)
-        if derivative is None or not _differentiated(args):
-            return super().call(routine, args)
-        (x,) = args
-        slope = derivative(x.detach())
-        return [ruled(value, lambda grad: (grad * slope,), x) for value in routine.values([plain(x)])]
+        """Return the results of a routine: by machine code where nothing is differentiated, as in random numbers."""
+        if not _differentiated(args):
+            return self._drawn(routine, args) if routine.cost > LONG else super().call(routine, args)
+        if derivative := _DERIVATIVES.get(routine.name):  # its operations on bits would not show it
+            (x,) = args
+            slope = derivative(x.detach())
+            return [ruled(value, lambda grad: (grad * slope,), x) for value in routine.values([plain(x)])]
+        return super().call(routine, args)
+
+    def _drawn(self, routine: Any, args: Sequence[Any]) -> list[Any]:
+        arrays = np.broadcast_arrays(*args)
+        if id(routine) not in self._codes:
+            self._codes[id(routine)] = Code(routine.function, arrays[0].dtype, len(arrays))
+        made = self._codes[id(routine)](np.stack(arrays).reshape(len(arrays), -1))
+        return list(made.reshape(-1, *arrays[0].shape))
 
 
 def _select(where: Any, x: Any, y: Any) -> torch.Tensor:

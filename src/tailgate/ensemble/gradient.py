@@ -8,18 +8,18 @@ A bound with hindsight has a schedule for each episode, found on that very episo
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tailgate.core import Array, Kind, draws
 from tailgate.core.draws import Keys
-from tailgate.ensemble.schedule import Schedule, Scheduled, steps_of
+from tailgate.ensemble.schedule import Schedule, Scheduled, schedule_of
 from tailgate.ensemble.search import FINAL, FIRST, MORE, Arena, Found
-from tailgate.ensemble.space import GENES, TRIGGERS, Rows
+from tailgate.ensemble.space import GENES
 from tailgate.play.metrics import METRICS
 from tailgate.play.trace import rollout
 
@@ -139,7 +139,7 @@ def worthiest(worth: Array, budget: int | None) -> Array:
     return rank < budget
 
 
-def gradient(arena: Arena, pace: Pace, out: Path, seed: int = 0, tell: Tell | None = None) -> list[Found]:
+def gradient(arena: Arena, pace: Pace, out: Path, seed: int = 0, tell: Tell | None = None, scripts: Sequence[str] = ()) -> list[Found]:
     """Search schedules of false data that do most harm; return them, the most harmful first.
 
     Parameters
@@ -152,6 +152,8 @@ def gradient(arena: Arena, pace: Pace, out: Path, seed: int = 0, tell: Tell | No
         The same seed finds the same schedules.
     tell
         Called after each round with its number, their count, the file, and the mean smooth damage.
+    scripts
+        Scripts of false data, `fdi` or `fdi_ramp`, from which the first ascents begin, such as the best of `search`.
 
     Returns
     -------
@@ -168,7 +170,7 @@ def gradient(arena: Arena, pace: Pace, out: Path, seed: int = 0, tell: Tell | No
     found, bound = [], None if arena.loop.model.followers.any() else arena.bound
     budget, brief = arena.loop.threat.budget, arena.loop.brief
     after = FIRST + MORE
-    for number, start in enumerate(starts(arena, pace, seed)):
+    for number, start in enumerate(starts(arena, pace, seed, scripts)):
         injection = Injection(arena.loop, start.when())
         begin = after + number * pace.rounds * pace.episodes
         path = out / f"gradient-{arena.scenario}-{'own' if arena.dose is None else arena.dose}-{arena.defence}-{number}.yaml"
@@ -191,12 +193,18 @@ def gradient(arena: Arena, pace: Pace, out: Path, seed: int = 0, tell: Tell | No
     return sorted(found, key=lambda one: -one.score)
 
 
-def starts(arena: Arena, pace: Pace, seed: int) -> list[Schedule]:
-    """Return the schedules of the most harmful scripts of false data, each with another trigger, among random ones."""
-    space = arena.space
+def starts(arena: Arena, pace: Pace, seed: int, scripts: Sequence[str] = ()) -> list[Schedule]:
+    """Return the schedules from which ascents begin: those of the given scripts, then of the most harmful among random ones.
+
+    The random ones differ in their triggers.
+    """
+    space, brief = arena.space, arena.loop.brief
     families = [i for i, family in enumerate(space.families) if family.kind == Kind.FDI and family.then is None]
     if not families:
         return []
+    given = [schedule_of(text, brief) for text in scripts[: pace.starts]]
+    if len(given) == pace.starts:
+        return given
     rng = np.random.default_rng([seed, zlib.crc32(f"gradient/{arena.scenario}/{arena.dose}/{arena.defence}".encode())])
     genomes = rng.random((pace.scripts, len(GENES)))
     genomes[:, 0] = (np.array(families)[np.arange(pace.scripts) % len(families)] + 0.5) / len(space.families)
@@ -204,24 +212,10 @@ def starts(arena: Arena, pace: Pace, seed: int) -> list[Schedule]:
     total = arena.scores(rows, 0, FIRST)
     best = np.argsort(-total, kind="stable")[: pace.starts * 8]
     again = total[best] + arena.scores(rows.take(best), FIRST, MORE)
-    out: dict[str, Schedule] = {}
+    out: dict[int, Schedule] = {}
     for i in best[np.argsort(-again, kind="stable")].tolist():
-        out.setdefault(TRIGGERS[int(rows.trigger[i])], _schedule(arena, rows, i))
-    return list(out.values())[: pace.starts]
-
-
-def _schedule(arena: Arena, rows: Rows, i: int) -> Schedule:
-    """Return what a script sends, as a schedule from the first step in which it could be on."""
-    threat, steps = arena.loop.threat, steps_of(arena.loop.brief)
-    name = TRIGGERS[int(rows.trigger[i])]
-    late = max(int(rows.start[i]) - threat.onset, 0) if name == "time" else 0
-    count = np.arange(steps) - late
-    on = (count >= 0) & (count % (rows.burst[i] + rows.pause[i]) < rows.burst[i])
-    on &= np.cumsum(on) <= (steps if threat.budget is None else threat.budget)
-    bounds = arena.loop.brief.bounds
-    value = np.clip((rows.base[i] + rows.rate[i] * (count + 1))[:, None, None] * rows.target[i], -bounds, bounds)
-    trigger: dict[str, Any] = {"name": "time"} if name == "time" else {"name": name, "threshold": float(rows.threshold[i])}
-    return Schedule(trigger, value, on)
+        out.setdefault(int(rows.trigger[i]), schedule_of(space.text(genomes[i]), brief))
+    return [*given, *out.values()][: pace.starts]
 
 
 def hindsight(arena: Arena, start: Schedule, episodes: int, rounds: int, purpose: str = "report", first: int = 0) -> float:

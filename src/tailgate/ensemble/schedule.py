@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,10 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
+from tailgate.agents.scripts.scripted import Inject, InjectRamp
 from tailgate.agents.scripts.triggers import TRIGGERS, Trigger, TriggerState, idle, part
+from tailgate.base.errors import InputError
 from tailgate.base.files import write_atomic
 from tailgate.core import Array, Command, Kind, View
 from tailgate.core.draws import Draws
+from tailgate.core.registry import Spec
 from tailgate.core.threat import Brief, fit
 
 
@@ -54,6 +58,36 @@ def steps_of(brief: Brief) -> int:
     """Return the longest schedule: the steps from the onset to the last one that is granted."""
     threat = brief.threat
     return max((brief.horizon if threat.end is None else min(threat.end, brief.horizon)) - threat.onset + 1, 1)
+
+
+def schedule_of(text: str, brief: Brief) -> Schedule:
+    """Return what a script of false data sends, as a schedule; one that opens at a time begins at the onset instead, silent at first.
+
+    Raises
+    ------
+    InputError
+        For an attack that is not `fdi` or `fdi_ramp`.
+    """
+    script = Spec("attack", text).make()
+    if not isinstance(script, (Inject, InjectRamp)):
+        raise InputError("script", text, "false data: fdi or fdi_ramp, with parameters")
+    plan, when, count = script.prepare(brief), script.when, np.arange(steps_of(brief))
+    late = type(when) is Trigger and when.start > brief.threat.onset
+    count = count - (when.start - brief.threat.onset if late else 0)
+    if isinstance(script, Inject):
+        value = np.full(len(count), script.value)
+    else:
+        value = np.clip(script.base + script.rate * (count + 1), -script.limit, script.limit)
+    on = (count >= 0) & (count < (np.inf if script.length is None else script.length))
+    if script.burst is not None:
+        on &= count % (script.burst + script.pause) < script.burst
+    on &= np.cumsum(on) <= (len(on) if brief.threat.budget is None else brief.threat.budget)
+    fields = {held.name: getattr(when, held.name) for held in dataclasses.fields(when) if getattr(when, held.name) != held.default}
+    for name in ("start", "window") if late else ("window",):
+        fields.pop(name, None)
+    name = next(name for name, kind in TRIGGERS.items() if kind is type(when))
+    target = plan.target * (1.0 if plan.extra is None else plan.extra)
+    return Schedule({"name": name} | fields, fit(brief, Kind.FDI, value[:, None, None] * target), on)
 
 
 @dataclass(frozen=True, eq=False)
