@@ -28,11 +28,12 @@ if TYPE_CHECKING:
     from tailgate.ensemble.injection import Injection
     from tailgate.ensemble.injection import Path as Course
 
-SOFT, WIDE = 0.5, 2.0  # of the soft minimum over gaps, and of the step from harmless to harm [m]
+SOFT, WIDE = 0.1, 0.5  # of the soft minimum over gaps, and of the step from harmless to harm [m]
+SLOPE = 1e-3  # of damage per metre of gap, or unit of error, far from harm
 SHARP, SHARE = 0.02, 0.1  # the same for errors, as shares of the largest error and of the bound
-FASTEST, SLOWEST = 0.3, 0.02  # steps of the first and of the last round, as shares of the largest value of a wire
+PACE, PATIENCE = 0.3, 2  # first step, as a share of a wire's largest value and of the budget; failures before it is halved
 LEAST = 0.02  # of a bound: the smallest value from which a wire's steps are reckoned
-MOMENTUM, MEMORY = 0.8, 0.7  # weights of earlier rounds in the direction, and in what an attacked step is worth
+MOMENTUM = 0.8  # weight of earlier rounds in the direction
 COMPARED = 256  # tune episodes on which the start and the end of an ascent are compared
 
 Tell = Callable[[int, int, str, float], None]
@@ -48,7 +49,7 @@ class Pace:
     episodes: int
 
 
-PACES = {"quick": Pace(256, 2, 16, 64), "standard": Pace(2048, 4, 40, 128)}
+PACES = {"quick": Pace(512, 2, 16, 128), "standard": Pace(2048, 4, 40, 256)}
 
 
 def smooth_damage(path: Course, follows: bool, bound: float | None) -> torch.Tensor:
@@ -68,10 +69,10 @@ def smooth_damage(path: Course, follows: bool, bound: float | None) -> torch.Ten
     live = tensor(path.live)
     if follows:
         least = -SOFT * torch.logsumexp(torch.where(live, -path.gap / SOFT, -torch.inf), dim=0)
-        return -torch.nn.functional.softplus(least / WIDE)
+        return torch.sigmoid(-least / WIDE) - SLOPE * least
     level = SHARP * float(torch.where(live, path.error.detach(), 0.0).max()) + 1e-300
     most = level * torch.logsumexp(torch.where(live, path.error / level, -torch.inf), dim=0)
-    return most if bound is None else -torch.nn.functional.softplus((bound - most) / (SHARE * bound))
+    return most if bound is None else torch.sigmoid((most - bound) / (SHARE * bound)) + SLOPE * most
 
 
 def gradient_of(injection: Injection, keys: Keys, sent: Array, bound: float | None) -> tuple[Array, Array]:
@@ -93,50 +94,75 @@ def gradient_of(injection: Injection, keys: Keys, sent: Array, bound: float | No
 
 
 def ascend(
-    injection: Injection, start: Schedule, budget: int | None, rounds: int, episodes: Callable[[int], Keys], bound: float | None,
+    injection: Injection, start: Schedule, budget: int | None, rounds: int, keys: Keys, bound: float | None,
     tell: Callable[[int, float], None] | None = None,
 ) -> Schedule:  # fmt: skip
-    """Ascend from a schedule by projected gradients with momentum; return the schedule of the last round.
+    """Ascend from a schedule by projected gradients with momentum; return the best schedule that was met.
 
     The derivative is taken as if every step were attacked, with values of 0 in those that are not (straight through).
-    A step is worth the derivative times its value; the budget goes to the worthiest steps.
+    A step is worth the derivative times its value; in each round some of the budget moves to worthier steps.
+    After some rounds without success the search goes back to the best schedule, and on with half the step.
 
     Parameters
     ----------
+    start
+        One schedule for all episodes, or one for each, which then ascends by itself.
     budget
         Attack steps of an episode, or None for all.
-    episodes
-        The episodes of a round, by its number from 0.
+    keys
+        The episodes, the same in all rounds.
+    bound
+        The error that counts as damage where nobody drives, see `smooth_damage`.
     tell
-        Called after each round with its number from 1, and the mean smooth damage before it.
+        Called after each round with its number from 1, and the best mean of the smooth damage so far.
     """
-    brief = injection.loop.brief
+    brief, shared = injection.loop.brief, start.values.ndim == 3
     bounds = np.where(brief.granted, brief.bounds, 0.0)
-    values, chosen = np.clip(start.values, -bounds, bounds), start.chosen
-    direction, worth = np.zeros_like(values), chosen.astype(float)
+    now = Schedule(start.trigger, np.clip(start.values, -bounds, bounds), start.chosen)
+    best, slope, direction = now, np.zeros_like(now.values), np.zeros_like(now.values)
+    lead = now.values.shape[:-3]
+    most, pace, failures = np.full(lead, -np.inf), np.full(lead, PACE), np.zeros(lead, int)
     for number in range(rounds):
-        sent = Schedule(start.trigger, values, chosen).sent
-        damage, slope = gradient_of(injection, episodes(number), sent, bound)
-        size = np.max(np.abs(slope), axis=(-3, -2, -1), keepdims=True)
-        direction = MOMENTUM * direction + slope / np.where(size > 0.0, size, 1.0)
-        scale = np.maximum(np.max(np.abs(values), axis=(-3, -2), keepdims=True), LEAST * bounds)
-        pace = SLOWEST + (FASTEST - SLOWEST) * (1.0 - number / rounds)
-        values = np.clip(values + pace * scale * np.sign(direction), -bounds, bounds)
-        gain = np.sum(slope * values, axis=(-2, -1))
-        most = np.max(np.abs(gain), axis=-1, keepdims=True)
-        worth = MEMORY * worth + (1.0 - MEMORY) * gain / np.where(most > 0.0, most, 1.0)
-        chosen = worthiest(worth, budget)
+        damage, found = gradient_of(injection, keys, now.sent, bound)
+        score = np.mean(damage) if shared else damage
+        better = score > most
+        most, failures = np.maximum(score, most), np.where(better, 0, failures + 1)
+        best, slope = _where(better, now, best), np.where(_wide(better, found), found, slope)
+        back = failures >= PATIENCE
+        now, found = _where(back, best, now), np.where(_wide(back, found), slope, found)
+        pace, failures = np.where(back, 0.5 * pace, pace), np.where(back, 0, failures)
+        size = np.max(np.abs(found), axis=(-3, -2, -1), keepdims=True)
+        direction = np.where(_wide(back, found), 0.0, MOMENTUM * direction) + found / np.where(size > 0.0, size, 1.0)
+        scale = np.maximum(np.max(np.abs(now.values), axis=(-3, -2), keepdims=True), LEAST * bounds)
+        values = np.clip(now.values + _wide(pace, found) * scale * np.sign(direction), -bounds, bounds)
+        now = Schedule(start.trigger, values, moved(now.chosen, np.sum(found * values, axis=(-2, -1)), budget, pace))
         if tell is not None:
-            tell(number + 1, float(np.mean(damage)))
-    return Schedule(start.trigger, values, chosen)
+            tell(number + 1, float(np.mean(most)))
+    return best
 
 
-def worthiest(worth: Array, budget: int | None) -> Array:
-    """Return a mask of the `budget` steps of greatest worth (..., T); of equals the first."""
+def _wide(x: Array, like: Array) -> Array:
+    return np.reshape(x, (*np.shape(x), *(1,) * (like.ndim - np.ndim(x))))
+
+
+def _where(mask: Array, new: Schedule, old: Schedule) -> Schedule:
+    values, chosen = (np.where(_wide(mask, x), x, y) for x, y in zip(new[1:], old[1:], strict=True))
+    return Schedule(new.trigger, values, chosen)
+
+
+def moved(chosen: Array, worth: Array, budget: int | None, share: Array) -> Array:
+    """Return the steps (..., T) that are attacked next: of the `chosen` all but a share (...) stay, the rest goes to the worthiest."""
     if budget is None or budget >= worth.shape[-1]:
         return np.ones(worth.shape, bool)
+    stay = budget - np.maximum(np.round(share * budget), 1).astype(int)
+    kept = worthiest(np.where(chosen, worth, -np.inf), stay) & chosen
+    return worthiest(np.where(kept, np.inf, worth), budget)
+
+
+def worthiest(worth: Array, count: int | Array) -> Array:
+    """Return a mask of the `count` (...) steps of greatest worth (..., T); of equals the first."""
     rank = np.argsort(np.argsort(-worth, axis=-1, kind="stable"), axis=-1, kind="stable")
-    return rank < budget
+    return np.asarray(rank < np.asarray(count)[..., None])
 
 
 def gradient(arena: Arena, pace: Pace, out: Path, seed: int = 0, tell: Tell | None = None, scripts: Sequence[str] = ()) -> list[Found]:
@@ -169,15 +195,11 @@ def gradient(arena: Arena, pace: Pace, out: Path, seed: int = 0, tell: Tell | No
 
     found, bound = [], None if arena.loop.model.followers.any() else arena.bound
     budget, brief = arena.loop.threat.budget, arena.loop.brief
-    after = FIRST + MORE
+    after = FIRST + MORE  # the episodes before chose the starts
+    keys = draws.keys("tune", range(after, after + pace.episodes))
     for number, start in enumerate(starts(arena, pace, seed, scripts)):
         injection = Injection(arena.loop, start.when())
-        begin = after + number * pace.rounds * pace.episodes
         path = out / f"gradient-{arena.scenario}-{'own' if arena.dose is None else arena.dose}-{arena.defence}-{number}.yaml"
-
-        def keys(turn: int, begin: int = begin) -> Keys:
-            first = begin + turn * pace.episodes
-            return draws.keys("tune", range(first, first + pace.episodes))
 
         def say(turn: int, damage: float, number: int = number, path: Path = path) -> None:
             if tell is not None:
@@ -187,7 +209,7 @@ def gradient(arena: Arena, pace: Pace, out: Path, seed: int = 0, tell: Tell | No
         scores = []
         for end in ends:
             end.write(path, brief, f"Found by gradients against {arena.defence} in {arena.scenario}.")
-            scores.append(arena.confirmed(str(path), "tune", after + pace.starts * pace.rounds * pace.episodes, COMPARED)[1])
+            scores.append(arena.confirmed(str(path), "tune", after + pace.episodes, COMPARED)[1])
         ends[int(np.argmax(scores))].write(path, brief, f"Found by gradients against {arena.defence} in {arena.scenario}.")
         found.append(Found(str(path), *arena.confirmed(str(path), "select", 0, FINAL), FINAL))
     return sorted(found, key=lambda one: -one.score)
@@ -229,7 +251,7 @@ def hindsight(arena: Arena, start: Schedule, episodes: int, rounds: int, purpose
     injection, bound = Injection(arena.loop, start.when()), None if arena.loop.model.followers.any() else arena.bound
     own = Schedule(start.trigger, *(np.repeat(part[None], episodes, axis=0) for part in (start.values, start.chosen)))
     hit = np.zeros(episodes, bool)
-    for schedule in (own, ascend(injection, own, arena.loop.threat.budget, rounds, lambda _: keys, bound)):
+    for schedule in (own, ascend(injection, own, arena.loop.threat.budget, rounds, keys, bound)):
         trace = rollout(arena.loop, Scheduled(schedule), keys, plain=True)
         hit |= (METRICS["crashed"](trace) > 0) | (METRICS["max_error"](trace) > (np.inf if bound is None else bound))
     return float(np.mean(hit))
