@@ -19,8 +19,8 @@ from tailgate.ensemble.search import Arena, Found
 from tailgate.play.trace import rollout
 
 torch = pytest.importorskip("torch")
-from tailgate.ensemble.gradient import Pace, ascend, gradient, gradient_masking, gradient_of, hindsight, moved, worthiest  # noqa: E402
-from tailgate.ensemble.injection import Injection  # noqa: E402
+from tailgate.ensemble.gradient import Pace, ascend, gradient, gradient_masking, gradient_of, hindsight, moved, smooth_damage, worthiest  # noqa: E402
+from tailgate.ensemble.injection import Course, Injection  # noqa: E402
 
 FDI = {"kinds": ("fdi",), "onset": 2, "end": None, "budget": None}
 SMOOTH = {"car": ("stop-and-go-v0", "kf", 40), "platoon": ("platoon-gusty-v0", "dkf", 8)}
@@ -215,6 +215,33 @@ def test_the_search_is_repeatable_and_its_file_is_an_attack(tmp_path, capsys, mo
     assert main([*command, "--defence", "kf", "--attack", found[0][0].script, "--seeds", "2", "--out", str(rows)]) == 0
     played = [json.loads(line) for line in rows.read_text().splitlines()]
     assert len(played) == 2 and all(row["status"] == "ok" and row["attack_steps"] > 0 for row in played), capsys.readouterr()
+
+
+def test_the_smooth_damage_follows_the_damage():
+    """A collision counts much and a near miss little, where somebody drives; else an error beyond the bound."""
+    rows = torch.tensor([[9.0, 5.0, 1.0, -1.0], [8.0, 6.0, 2.0, -2.0]], dtype=torch.float64)
+    course = Course(rows, 10.0 - rows, np.array([[True] * 4, [True, True, True, False]]))
+    by_gap = smooth_damage(course, True, None).numpy()
+    assert np.all(np.diff(by_gap) > 0.0) and by_gap[3] > 0.85 and by_gap[2] < 0.15  # -1 m before it ended, 1 m
+    by_error = smooth_damage(course, False, 10.0).numpy()
+    assert np.all(np.diff(by_error) > 0.0) and by_error[3] > 0.7 and by_error[0] < 0.01
+    assert np.allclose(smooth_damage(course, False, None).numpy(), [2.0, 5.0, 9.0, 11.0], atol=0.2)  # the largest errors
+
+
+def test_episodes_side_by_side_change_no_derivative(monkeypatch):
+    loop = loop_of(*LOOPS["car"])
+    injection, keys, schedule = Injection(loop, Trigger()), draws.keys("train", range(5)), drawn(loop, 6)
+    together = [gradient_of(injection, keys, sent, None) for sent in (schedule.sent, for_each(schedule, 5).sent)]
+    monkeypatch.setattr("tailgate.ensemble.gradient.ROOM", 2.5 * 8 * injection.operations * loop.horizon)
+    apart = [gradient_of(injection, keys, sent, None) for sent in (schedule.sent, for_each(schedule, 5).sent)]
+    for one, two in zip(together, apart, strict=True):
+        assert np.array_equal(one[0], two[0]) and np.allclose(one[1], two[1], rtol=1e-12, atol=1e-15)
+    assert np.allclose(together[0][1], together[1][1].sum(axis=0), rtol=1e-9, atol=1e-15) and together[0][1].any()
+
+
+def test_a_pace_without_rounds_is_refused():
+    with pytest.raises(InputError, match=r"pace.rounds.*at least 1"):
+        Pace(64, 1, 0, 8)
 
 
 def test_no_false_data_no_schedule(tmp_path):

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tailgate.base.errors import InputError
 from tailgate.core import Array, Kind, draws
 from tailgate.core.draws import Keys
 from tailgate.ensemble.schedule import Schedule, Scheduled, schedule_of
@@ -25,8 +26,7 @@ from tailgate.play.trace import rollout
 
 if TYPE_CHECKING:
     from tailgate.engine.torch_form import torch
-    from tailgate.ensemble.injection import Injection
-    from tailgate.ensemble.injection import Path as Course
+    from tailgate.ensemble.injection import Course, Injection
 
 SOFT, WIDE = 0.1, 0.5  # of the soft minimum over gaps, and of the step from harmless to harm [m]
 SLOPE = 1e-3  # of damage per metre of gap, or unit of error, far from harm
@@ -34,6 +34,7 @@ SHARP, SHARE = 0.02, 0.1  # the same for errors, as shares of the largest error 
 PACE, PATIENCE = 0.3, 2  # first step, as a share of a wire's largest value and of the budget; failures before it is halved
 LEAST = 0.02  # of a bound: the smallest value from which a wire's steps are reckoned
 MOMENTUM = 0.8  # weight of earlier rounds in the direction
+ROOM = 1e9  # [bytes] of what the derivatives of episodes side by side keep
 COMPARED = 256  # tune episodes on which the start and the end of an ascent are compared
 
 Tell = Callable[[int, int, str, float], None]
@@ -47,6 +48,11 @@ class Pace:
     starts: int
     rounds: int
     episodes: int
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value < 1:
+                raise InputError(f"pace.{name}", value, "a whole number, at least 1")
 
 
 PACES = {"quick": Pace(512, 2, 16, 128), "standard": Pace(2048, 4, 40, 256)}
@@ -80,6 +86,16 @@ def gradient_of(injection: Injection, keys: Keys, sent: Array, bound: float | No
 
     A derivative that is not finite counts as 0: its direction is unknown.
     """
+    each = max(int(ROOM // (8 * injection.operations * injection.loop.horizon)), 1)
+    parts = []
+    for first in range(0, len(keys.key), each):
+        some = slice(first, first + each)
+        parts.append(_gradient(injection, Keys(keys.key[some], keys.episode[some]), sent if sent.ndim == 3 else sent[some], bound))
+    damage, slopes = (list(column) for column in zip(*parts, strict=True))
+    return np.concatenate(damage), np.sum(slopes, axis=0) if sent.ndim == 3 else np.concatenate(slopes)
+
+
+def _gradient(injection: Injection, keys: Keys, sent: Array, bound: float | None) -> tuple[Array, Array]:
     from tailgate.engine.torch_form import torch
     from tailgate.ensemble.injection import single_thread
 

@@ -22,7 +22,7 @@ from tailgate.engine.program import traced
 from tailgate.engine.torch_form import TorchForm, tensor, torch
 
 
-class Path(NamedTuple):
+class Course(NamedTuple):
     """The course of episodes; tensors (K, B) that depend on the schedule, and the steps that count."""
 
     gap: torch.Tensor  # smallest gap of a car behind another [m]; inf where nobody drives
@@ -71,12 +71,12 @@ class Injection:
         made = {"gap": gap, "error": error, "over": over, "on": after["on"], "count": after["count"]}
         return {"loop": state} | after, made
 
-    def play(self, keys: Keys, schedule: torch.Tensor) -> Path:
+    def play(self, keys: Keys, schedule: torch.Tensor) -> Course:
         """Play episodes under a schedule (T, N, w), or one for each of them (B, T, N, w).
 
         Returns
         -------
-        Path
+        Course
             With derivatives for the schedule. It ends early when all episodes have.
         """
         begun, batch = self._begun(keys), len(keys.key)
@@ -97,7 +97,7 @@ class Injection:
                     columns[name].append(tensor(made[name]).expand(batch))
                 if made["over"].all():
                     break
-        return Path(torch.stack(columns["gap"]), torch.stack(columns["error"]), np.stack(columns["live"]))
+        return Course(torch.stack(columns["gap"]), torch.stack(columns["error"]), np.stack(columns["live"]))
 
 
 @contextlib.contextmanager
