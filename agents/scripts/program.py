@@ -156,9 +156,9 @@ class Program:
                 continue
             now, on, count = ready.trigger.step(ready.timing, state.trigger, view, draws)
             hit = draws.uniform(ready.target.shape, HIT) < ready.probability
-            target = ready.target & hit
-            on = on & here & view.allowed & target.any(axis=(1, 2))
             law = ready.phase.value
+            target = ready.target & hit if law is None else ready.target & hit & law.sends(brief, count)
+            on = on & here & view.allowed & target.any(axis=(1, 2))
             value = 0.0 if law is None else fit(brief, ready.kind, law.sample(brief, count, draws, FIRST))
             part = brief.command(on, ready.kind, target, value)
             command = Command(*(np.where(_rows(here, new), new, old) for new, old in zip(part, command, strict=True)))

@@ -291,7 +291,7 @@ class InjectSparse(Script):
         return plan._replace(extra=np.array([held.get(name, 0.0) for name in brief.model.wires]))
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
-        return inject(plan, on, self.law, count, draws, TAGS, wires_hit(plan, plan.extra, draws))
+        return inject(plan, on, self.law, count, draws, TAGS, wires_hit(plan, plan.extra, draws) & self.law.sends(plan.brief, count))
 
 
 @register("attack", "actuator_fdi")

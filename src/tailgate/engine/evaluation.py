@@ -2,71 +2,162 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
-from tailgate.engine.graph import Body, Graph, Matrix, Node, Sweep, computed, ordered, packed_values, read
-from tailgate.engine.operations import Array
+from tailgate.engine.graph import Body, Graph, Node, Source, Sweep, computed, ordered
+from tailgate.engine.operations import Array, apply
 
 
 def evaluate(graph: Graph, roots: Sequence[Node], inputs: dict[Any, Array]) -> list[Array]:
     """Return the values of the roots by numpy, for inputs (B,) by name."""
-    values: dict[int, Any] = {}
-    _evaluate(graph, ordered(roots), inputs, values)
-    return [values[root.id] for root in roots]
+    return Evaluation(graph, roots)(inputs)
 
 
-def _evaluate(graph: Graph, nodes: Iterable[Node], inputs: dict[Any, Array], values: dict[int, Any]) -> None:
-    for node in nodes:
-        args = [graph.value(a) if a.fixed else values[a.id] for a in node.args]
-        if node.fixed:
-            values[node.id] = graph.value(node)
-        elif node.op in ("input", "held"):
-            values[node.id] = inputs[node.attr]
-        elif node.op == "gather":
-            values[node.id] = np.array([graph.value(entry) for entry in node.attr], node.dtype)[args[0]]
-        elif node.op == "matvec":
-            values[node.id] = _multiplied(graph, node.attr, args)
-        elif node.op == "loop":
-            values[node.id] = _looped(graph, node.attr, args, values)
-        elif node.op == "sweep":
-            values[node.id] = _swept(graph, node.attr, values)
-        elif node.op == "pack":
-            values[node.id] = [x for piece in node.attr for x in packed_values(graph, piece, values)]
-        else:
-            values[node.id] = computed(node, args)
+class Evaluation:
+    """The values of some roots of a graph, for inputs (B,) by name; a subclass may replace the operations."""
 
+    def __init__(self, graph: Graph, roots: Sequence[Node]) -> None:
+        self.graph, self.roots = graph, list(roots)
+        self._order = ordered(roots)
+        self._inputs: dict[Any, Any] = {}
+        self._fixed: dict[int, Any] = {}
+        self._values: dict[int, Any] = {}
+        self._depth = 0  # sweeps around the node that is evaluated
+        self._routines: dict[int, Evaluation] = {}
+        self._parts: dict[str, Callable[[Node, list[Any]], Any]] = {
+            "input": self._given, "held": self._given, "gather": self._gathered, "matvec": self._multiplied, "loop": self._looped,
+            "sweep": self._swept, "pack": self._packed, "call": lambda node, args: self.call(node.attr, args),
+        }  # fmt: skip
 
-def _multiplied(graph: Graph, held: Matrix, args: Sequence[Any]) -> list[Any]:
-    matrix, there, _ = held
-    x, out = args[: matrix.shape[1]], list(args[matrix.shape[1] :])
-    for i, k in np.ndindex(*matrix.shape):
-        if there is None or there[i, k]:
-            out[i] = out[i] + graph.value(matrix.item(i, k)) * x[k]
-    return out
+    @property
+    def operations(self) -> int:
+        """The number of operations."""
+        return sum(not node.fixed for node in self._order)
 
+    def __call__(self, inputs: dict[Any, Any]) -> list[Any]:
+        """Return the values of the roots."""
+        self._inputs, self._values = inputs, dict(self._fixed)
+        with np.errstate(all="ignore"):
+            self._run(self._order)
+        return [self._value(root) for root in self.roots]
 
-def _looped(graph: Graph, body: Body, args: Sequence[Any], values: dict[int, Any]) -> list[Any]:
-    held = list(args[: len(body.carried)])
-    going = held[: len(body.going)]
-    for _ in range(body.most):
-        if not any(np.any(one) for one in going):
-            break
-        inner = values | {node.id: value for node, value in zip(body.carried, held, strict=True)}
-        _evaluate(graph, body.nodes, {}, inner)
-        held = [graph.value(node) if node.fixed else inner[node.id] for node in body.after]
-        going = held[: len(body.going)]
-    return held
+    # -- operations; a buffer is an array (size, ..., B), with the axes of the sweeps around it between
 
+    def compute(self, node: Node, args: Sequence[Any]) -> Any:
+        """Return the value of an operation for these values of its arguments."""
+        if node.op == "pick":
+            return args[0][node.attr]
+        if node.op == "invert":
+            return np.stack(computed(node, [list(args[0])]))
+        if node.op == "blend":
+            return np.where(args[0], *map(self.aligned, args[1:]))
+        return apply(node.op, node.dtype, args)
 
-def _swept(graph: Graph, sweep: Sweep, values: dict[int, Any]) -> list[Any]:
-    out = []
-    for index in np.ndindex(*sweep.shape):
-        inner = dict(values)
+    def multiply(self, matrix: Array, there: Array | None, x: Any, base: Any) -> Any:
+        """Return base + matrix x for a matrix (p, q) and buffers x (q, ...) and base (p, ...), see `Graph.matvec`."""
+        return multiplied(matrix, there, x, base)
+
+    def stack(self, columns: Sequence[Any]) -> Any:
+        """Return a buffer of numbers that broadcast."""
+        return self.aligned(np.stack(np.broadcast_arrays(*columns)))
+
+    def join(self, buffers: Sequence[Any]) -> Any:
+        """Return one buffer of several."""
+        shape = np.broadcast_shapes(*(x.shape[1:] for x in buffers))
+        return np.concatenate([np.broadcast_to(x, (len(x), *shape)) for x in buffers])
+
+    def taken(self, buffer: Any, places: Array) -> Any:
+        """Return the numbers of a buffer at some places."""
+        return buffer[places]
+
+    def call(self, routine: Any, args: Sequence[Any]) -> list[Any]:
+        """Return the results of a routine (engine/routines.py)."""
+        inner = self._routines.get(id(routine))
+        if inner is None:
+            inner = self._routines[id(routine)] = type(self)(routine.graph, routine.outputs)
+        return inner(dict(zip((node.attr for node in routine.inputs), args, strict=True)))
+
+    def aligned(self, x: Any) -> Any:
+        """Return a buffer with an axis for each sweep around this place."""
+        return x.reshape(len(x), *(1,) * (self._depth + 2 - x.ndim), *x.shape[1:])
+
+    # -- nodes
+
+    def _value(self, node: Node) -> Any:
+        if node.id not in self._values:  # a fixed one
+            value = self.graph.value(node)
+            self._values[node.id] = self._fixed[node.id] = np.array(value) if node.size else value
+        return self._values[node.id]
+
+    def _run(self, nodes: Iterable[Node]) -> None:
+        values, parts = self._values, self._parts
+        for node in nodes:
+            if not node.fixed:
+                args = [values[a.id] if a.id in values else self._value(a) for a in node.args]
+                part = parts.get(node.op)
+                values[node.id] = self.compute(node, args) if part is None else part(node, args)
+
+    def _given(self, node: Node, args: list[Any]) -> Any:
+        given = self._inputs[node.attr]
+        return self.stack(given) if isinstance(given, list) else given
+
+    def _gathered(self, node: Node, args: list[Any]) -> Any:
+        return np.array([self._value(entry) for entry in node.attr], node.dtype)[args[0]]
+
+    def _packed(self, node: Node, args: list[Any]) -> Any:
+        return self.join([
+            self.stack([self._value(source)]) if isinstance(source, Node) else self._read(source, shape) for source, shape in node.attr
+        ])  # fmt: skip
+
+    def _read(self, source: Source, shape: tuple[int, ...]) -> Any:
+        """Return the numbers of a source for all indices of a shape."""
+        places = (np.indices(shape).reshape(len(shape), -1).T @ np.array(source.strides, int) + source.offset).astype(int)
+        if isinstance(source.held, Node):
+            return self.aligned(self.taken(self._value(source.held), places))
+        return self.aligned(np.array([self._value(source.held[place]) for place in places]))
+
+    def _multiplied(self, node: Node, args: list[Any]) -> Any:
+        matrix, there, _ = node.attr
+        numbers = np.array([self._value(one) for one in matrix.flat]).reshape(matrix.shape)
+        return self.multiply(numbers, there, self.stack(args[: matrix.shape[1]]), self.stack(args[matrix.shape[1] :]))
+
+    def _looped(self, node: Node, args: list[Any]) -> list[Any]:
+        body: Body = node.attr
+        held = args[: len(body.carried)]
+        for _ in range(body.most):
+            if not any(np.any(one) for one in held[: len(body.going)]):
+                break
+            self._values.update(zip((one.id for one in body.carried), held, strict=True))
+            self._run(body.nodes)
+            held = [self._value(one) for one in body.after]
+        return held
+
+    def _swept(self, node: Node, args: list[Any]) -> Any:
+        """Return the numbers of all rounds; the rounds are independent, and run at once."""
+        sweep: Sweep = node.attr
         for one, source in zip(sweep.carried, sweep.sources, strict=True):
-            inner[one.id] = read(graph, source, index, values)
-        _evaluate(graph, sweep.nodes, {}, inner)
-        out += [graph.value(node) if node.fixed else inner[node.id] for node in sweep.after]
+            self._values[one.id] = self._read(source, sweep.shape)
+        self._depth += 1
+        self._run(sweep.nodes)
+        made = self.stack([self._value(one) for one in sweep.after])
+        self._depth -= 1
+        rounds = int(np.prod(sweep.shape, dtype=int))
+        return self.spread(made, rounds)
+
+    def spread(self, made: Any, rounds: int) -> Any:
+        """Return the results (count, rounds or 1, ...) of a sweep as a buffer, round by round."""
+        if made.shape[1] != rounds:
+            made = made.repeat(rounds, 1)
+        return made.swapaxes(0, 1).reshape(rounds * len(made), *made.shape[2:])
+
+
+def multiplied(matrix: Array, there: Array | None, x: Array, base: Array) -> Array:
+    """Return base (p, ...) + matrix (p, q) x (q, ...), summed over q in ascending order, without the entries that are not in `there`."""
+    out = np.array(np.broadcast_to(base, (len(base), *np.broadcast_shapes(base.shape[1:], x.shape[1:]))))
+    for k, column in enumerate(matrix.T):
+        rows = slice(None) if there is None else there[:, k]
+        out[rows] = out[rows] + column[rows].reshape(-1, *(1,) * (out.ndim - 1)) * x[k]
     return out

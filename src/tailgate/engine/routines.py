@@ -21,6 +21,7 @@ class Routine:
     """A function of numbers of given types, traced by itself."""
 
     name: str
+    function: Callable[..., Any]
     graph: Graph
     inputs: list[Node]
     outputs: list[Node]
@@ -62,7 +63,7 @@ class _Called:
             made = self.function(*(Traced(graph, boxed(node), node.dtype) for node in inputs))
             several = isinstance(made, tuple)
             outputs = [part.nodes.item() for part in (made if several else (made,))]
-            self._made[dtypes] = Routine(self.function.__name__, graph, inputs, outputs), several
+            self._made[dtypes] = Routine(self.function.__name__, self.function, graph, inputs, outputs), several
         return self._made[dtypes]
 
 

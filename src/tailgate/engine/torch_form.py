@@ -1,0 +1,274 @@
+"""The torch form of a trace: the same numbers, with derivatives. It is not the scored path.
+
+Numbers that no differentiated argument reaches stay numpy's; the others are float64 tensors on the processor.
+Each operation gives the bits that numpy gives. Comparisons, roundings and conversions to whole numbers have derivative 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from tailgate.engine.compiled import Code
+from tailgate.engine.evaluation import Evaluation, multiplied
+from tailgate.engine.graph import Graph, Node, computed
+from tailgate.engine.operations import COMPARISONS, FLOAT, Array
+from tailgate.engine.program import Trace
+
+try:
+    import torch as torch  # for those who differentiate
+except ImportError as error:
+    raise ImportError("derivatives of a loop need PyTorch: pip install 'tailgate[train]'") from error
+
+LONG = 100  # nodes of a routine that is worth machine code
+Rule = Callable[[torch.Tensor], tuple[torch.Tensor, ...]]
+_FLAT = {"floor", "ceil", "trunc", "rint", "not", "bits", *COMPARISONS}  # operations with derivative 0
+_DERIVATIVES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {"log": torch.reciprocal}  # of routines on the bits of a number
+
+
+class _Ruled(torch.autograd.Function):
+    """A value of numpy, with a rule for its derivatives."""
+
+    @staticmethod
+    def forward(ctx: Any, value: Array, rule: Rule, *inputs: torch.Tensor) -> torch.Tensor:
+        ctx.rule = rule
+        return tensor(value)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        return None, None, *ctx.rule(grads[0])
+
+
+def ruled(value: Array, rule: Rule, *inputs: torch.Tensor) -> torch.Tensor:
+    """Return a value with a rule: from its gradient, the gradients of the inputs."""
+    return _Ruled.apply(value, rule, *inputs)  # type: ignore[no-any-return, no-untyped-call]
+
+
+def tensor(x: Any) -> torch.Tensor:
+    """Return x as a tensor; arrays that may be written are shared."""
+    if isinstance(x, torch.Tensor):
+        return x
+    held = np.asarray(x)
+    return torch.from_numpy(held if held.flags.writeable and min(held.strides, default=0) >= 0 else held.copy())
+
+
+def plain(x: Any) -> Any:
+    """Return the numbers of a tensor."""
+    return x.detach().numpy() if isinstance(x, torch.Tensor) else x
+
+
+def _differentiated(args: Sequence[Any]) -> bool:
+    return any(isinstance(x, torch.Tensor) for x in args)
+
+
+class TorchEvaluation(Evaluation):
+    """The values of some roots; tensors among the inputs (B,) are differentiated."""
+
+    def __init__(self, graph: Graph, roots: Sequence[Node]) -> None:
+        super().__init__(graph, roots)
+        self._parts_of: dict[int, tuple[torch.Tensor, Sequence[torch.Tensor]]] = {}
+        self._codes: dict[int, Code] = {}
+
+    def compute(self, node: Node, args: Sequence[Any]) -> Any:
+        """Return the value of an operation: a tensor if one of its arguments is one and the operation has a derivative."""
+        if node.op == "pick" and isinstance(args[0], torch.Tensor):
+            return self._parted(node.args[0], args[0])[node.attr]
+        if not _differentiated(args):
+            return super().compute(node, args)
+        if node.op in _FLAT or (node.op == "cast" and node.dtype != FLOAT):
+            return super().compute(node, [plain(a) for a in args])
+        if node.op == "invert":
+            return _inverted(node, args[0])
+        if node.op == "blend":
+            return _select(args[0], *map(self.aligned, args[1:]))
+        return _OPERATIONS[node.op](*args)
+
+    def multiply(self, matrix: Array, there: Array | None, x: Any, base: Any) -> Any:
+        """Return base + matrix x, see `Evaluation.multiply`."""
+        if not _differentiated([x, base]):
+            return super().multiply(matrix, there, x, base)
+        right, begin = tensor(x), tensor(base)
+        factor = tensor(matrix if there is None else np.where(there, matrix, 0.0))
+        sizes = right.shape, begin.shape
+
+        def rule(grad: torch.Tensor) -> tuple[torch.Tensor, ...]:
+            return torch.tensordot(factor.T, grad, 1).sum_to_size(sizes[0]), grad.sum_to_size(sizes[1])
+
+        return ruled(multiplied(matrix, there, plain(right), plain(begin)), rule, right, begin)
+
+    def stack(self, columns: Sequence[Any]) -> Any:
+        """Return a buffer of numbers that broadcast."""
+        if not _differentiated(columns):
+            return super().stack(columns)
+        return self.aligned(torch.stack(torch.broadcast_tensors(*map(tensor, columns))))  # type: ignore[no-untyped-call]
+
+    def join(self, buffers: Sequence[Any]) -> Any:
+        """Return one buffer of several."""
+        if not _differentiated(buffers):
+            return super().join(buffers)
+        shape = np.broadcast_shapes(*(tuple(x.shape[1:]) for x in buffers))
+        return torch.cat([tensor(x).expand(len(x), *shape) for x in buffers])
+
+    def spread(self, made: Any, rounds: int) -> Any:
+        """Return the results of a sweep as a buffer."""
+        if isinstance(made, torch.Tensor) and made.shape[1] != rounds:
+            made = made.expand(len(made), rounds, *made.shape[2:])
+        return super().spread(made, rounds)
+
+    def taken(self, buffer: Any, places: Array) -> Any:
+        """Return the numbers of a buffer at some places."""
+        if not isinstance(buffer, torch.Tensor):
+            return super().taken(buffer, places)
+        return buffer if np.array_equal(places, np.arange(len(buffer))) else buffer.index_select(0, torch.from_numpy(places))
+
+    def _parted(self, node: Node, buffer: torch.Tensor) -> Sequence[torch.Tensor]:
+        """Return the numbers of a buffer; parting it once has a faster derivative than a choice of each."""
+        held = self._parts_of.get(node.id)
+        if held is None or held[0] is not buffer:
+            held = self._parts_of[node.id] = buffer, buffer.unbind()
+        return held[1]
+
+    def call(self, routine: Any, args: Sequence[Any]) -> list[Any]:
+        """Return the results of a routine: by machine code where nothing is differentiated, as in random numbers."""
+        if not _differentiated(args):
+            return self._drawn(routine, args) if routine.cost > LONG else super().call(routine, args)
+        if derivative := _DERIVATIVES.get(routine.name):  # its operations on bits would not show it
+            (x,) = args
+            slope = derivative(x.detach())
+            return [ruled(value, lambda grad: (grad * slope,), x) for value in routine.values([plain(x)])]
+        return super().call(routine, args)
+
+    def _drawn(self, routine: Any, args: Sequence[Any]) -> list[Any]:
+        arrays = np.broadcast_arrays(*args)
+        if id(routine) not in self._codes:
+            self._codes[id(routine)] = Code(routine.function, arrays[0].dtype, len(arrays))
+        made = self._codes[id(routine)](np.stack(arrays).reshape(len(arrays), -1))
+        return list(made.reshape(-1, *arrays[0].shape))
+
+
+def _select(where: Any, x: Any, y: Any) -> torch.Tensor:
+    return torch.where(tensor(where), tensor(x), tensor(y))
+
+
+def _divide(x: Any, y: Any) -> torch.Tensor:
+    """Return x / y; where y is 0 the derivative is 0, because such a quotient is never selected."""
+    left, right = tensor(x), tensor(y)
+    if not (zero := right.detach() == 0.0).any():
+        return torch.div(left, right)
+    with np.errstate(all="ignore"):
+        held = tensor(np.true_divide(plain(left), plain(right)))
+    return torch.where(zero, held, torch.div(left, torch.where(zero, 1.0, right)))
+
+
+def _root(x: torch.Tensor) -> torch.Tensor:
+    """Return the square root, with derivative 0 at 0; the library's own is not rounded as numpy's."""
+    value = np.sqrt(plain(x))
+    slope = tensor(np.where(value == 0.0, 0.0, 0.5 / value))
+    return ruled(value, lambda grad: (grad * slope,), x)
+
+
+def _least(x: Any, y: Any) -> torch.Tensor:
+    a, b = plain(x), plain(y)
+    return _select((a < b) | (a != a), x, y)
+
+
+def _most(x: Any, y: Any) -> torch.Tensor:
+    a, b = plain(x), plain(y)
+    return _select((a > b) | (a != a), x, y)
+
+
+def _remainder(x: Any, y: Any) -> torch.Tensor:
+    left, right = tensor(x), tensor(y)
+    quotient = torch.floor(left.detach() / right.detach())
+    sizes = left.shape, right.shape
+    return ruled(
+        np.remainder(plain(left), plain(right)),
+        lambda grad: (grad.sum_to_size(sizes[0]), (-quotient * grad).sum_to_size(sizes[1])), left, right,
+    )  # fmt: skip
+
+
+def _inverted(node: Node, numbers: torch.Tensor) -> torch.Tensor:
+    """Return the inverses of symmetric matrices; a change D of one changes its inverse S by -S D S."""
+    q = node.attr
+    value = np.stack(computed(node, [list(plain(numbers))]))
+
+    def matrices(x: torch.Tensor) -> torch.Tensor:
+        return x.movedim(0, -1).reshape(*x.shape[1:], -1, q, q)
+
+    inverse = matrices(tensor(value)).mT
+
+    def rule(grad: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return (-(inverse @ matrices(grad) @ inverse).reshape(*grad.shape[1:], -1).movedim(-1, 0),)
+
+    return ruled(value, rule, numbers)
+
+
+_OPERATIONS: dict[str, Callable[..., Any]] = {
+    "add": lambda x, y: torch.add(tensor(x), tensor(y)), "sub": lambda x, y: torch.sub(tensor(x), tensor(y)),
+    "mul": lambda x, y: torch.mul(tensor(x), tensor(y)), "div": _divide, "min": _least, "max": _most, "rem": _remainder,
+    "neg": torch.neg, "abs": torch.abs, "sqrt": _root, "select": _select, "cast": lambda x: x,
+}  # fmt: skip
+
+
+class TorchForm:
+    """The steps of a trace. The state is a mapping from the names of inputs to numbers (B,), tensors where they are differentiated."""
+
+    def __init__(self, trace: Trace, results: Sequence[str]) -> None:
+        """Keep what the named results of all steps need.
+
+        Parameters
+        ----------
+        trace : of a function that maps a state and arguments to the next state and results
+        results : names of results, one number of an episode each
+        """
+        following: dict[int, tuple[Any, Node]] = {}
+        for name, (here, there) in trace.state.items():
+            pairs = [trace.large[name]] if name in trace.large else zip(here.flat, there.flat, strict=True)
+            following |= {now.id: (now.attr, new) for now, new in pairs}
+        self._arguments, self._results = trace.arguments, tuple(results)
+        asked = [trace.results[name].item() for name in results]
+        self._state = _needed(asked, following)
+        self._evaluation = TorchEvaluation(trace.graph, [*asked, *self._state.values()])
+        self._large = {now.attr for now, _ in trace.large.values()}
+
+    @property
+    def operations(self) -> int:
+        """The operations of a step."""
+        return self._evaluation.operations
+
+    def start(self, leaves: dict[str, Array]) -> dict[Any, Any]:
+        """Return the state for its leaves (B, ...) by dotted name."""
+        out = {}
+        for name in self._state:
+            leaf = leaves[name[1]]
+            out[name] = np.array(leaf.reshape(len(leaf), -1).T if name in self._large else leaf[(slice(None), *name[2])], order="C")
+        return out
+
+    def step(self, state: dict[Any, Any], arguments: dict[str, Any]) -> tuple[dict[Any, Any], dict[str, Any]]:
+        """Return the next state and the results (B,), for arguments (B, ...), arrays or tensors."""
+        given = dict(state)
+        for name, nodes in self._arguments.items():
+            for place in np.ndindex(*nodes.shape[1:]):
+                given[nodes[(0, *place)].attr] = arguments[name][(slice(None), *place)]
+        made = self._evaluation(given)
+        count = len(self._results)
+        return dict(zip(self._state, made[count:], strict=True)), dict(zip(self._results, made[:count], strict=True))
+
+
+def _needed(asked: Sequence[Node], following: dict[int, tuple[Any, Node]]) -> dict[Any, Node]:
+    """Return, by input, the nodes of the next state that the asked nodes need, now or in a later step."""
+    out: dict[Any, Node] = {}
+    left, seen = list(asked), set()
+    while left:
+        node = left.pop()
+        if node.id in seen:
+            continue
+        seen.add(node.id)
+        left.extend(node.args)
+        if node.id in following:
+            name, new = following[node.id]
+            out[name] = new
+            left.append(new)
+    return out
