@@ -82,7 +82,7 @@ def _falsify(options: argparse.Namespace) -> int:
 
 def _print_replay(held: dict[str, Any]) -> None:
     _print_formulas(held)
-    say("the same episode, to the last bit" if held["same"] else "another episode than the file's: another defence, or the code or the file has changed")
+    say("the same episode, to the last bit" if held["same"] else "another episode than that of the file: another defence, or changed code")
 
 
 def _print(report: dict[str, Any]) -> None:
@@ -93,7 +93,9 @@ def _print(report: dict[str, Any]) -> None:
     )
     if not report["violated"]:
         say("no counterexample was found: that is no proof that there is none")
-    say(f"attack found: {found['found']['attack']}, {found['found']['steps']} attacked steps, robustness {found['found']['robustness']:.4g}")
+    say(
+        f"attack found: {found['found']['attack']}, {found['found']['steps']} attacked steps, robustness {found['found']['robustness']:.4g}"
+    )
     if report["violated"]:
         say(f"shrunk: {found['steps']} attacked steps, robustness {found['robustness']:.4g}{', a collision' if found['collided'] else ''}")
     say(f"road: {', '.join(f'{name} {value:.2f}' for name, value in found['road'].items())}; seed {found['seed']} ({found['purpose']})")

@@ -62,6 +62,4 @@ class Branches:
     def __call__(self, keys: Array) -> Array:
         """Return margins (K, B) of keys (K, B, 3)."""
         parts = [keys[:, first : first + self.at_once] for first in range(0, keys.shape[1], self.at_once)]
-        return np.concatenate(
-            [self.invariant.margins(played(self.loop, self.attack, part), self.loop.horizon) for part in parts], axis=1
-        )
+        return np.concatenate([self.invariant.margins(played(self.loop, self.attack, part), self.loop.horizon) for part in parts], axis=1)

@@ -16,12 +16,14 @@ from scipy.stats import norm
 from tailgate.core import Array
 
 ELITE = 0.1  # share of the samples that the next mean is made of
+STARTS = 3  # of the whole search: failures at other times are other minima
 ROUNDS = 40  # of cross-entropy, at most
 COARSE = 10  # parts of the time over which its mean is constant: more would be noise
-POLISHED = 12  # steps along the gradient, at most
+POLISHED = 8  # steps along the gradient, at most
 NUDGE = 0.05  # of a difference, in standard deviations
-SCALES = np.arange(32, 97) / 64  # of a mean, for the least one that fails
-LINE = np.arange(17) / 16  # between a mean and the next
+SCALES = np.arange(4, 13) / 8  # of a mean, for the least one that fails
+FINER = np.arange(1, 17) / 16  # between the least scale that fails and the one below
+LINE = np.arange(9) / 8  # between a mean and the next
 LITTLE = 1e-3  # relative gain that ends the polishing
 Tell = Callable[[int, int, float], None]  # round, at most, distance that is left
 
@@ -65,20 +67,31 @@ def likeliest(
     rng
         Chance of the keys.
     """
-    mean, episodes = _moved(play, steps, width, samples, rng, tell)
-    best, more = _least(play, mean[None], 2.0 * SCALES)
-    episodes += more
-    for _ in range(POLISHED if best is not None else 0):
-        assert best is not None
-        direction, count = _next(play, best, min(blocks, steps))
-        tried, more = _least(play, best + LINE[:, None, None] * (direction - best), SCALES)
+    update, found, failed, episodes = tell or (lambda *_: None), list[Array](), list[bool](), 0
+    for number in range(STARTS):
+        mean, count = _moved(play, steps, width, samples, rng, lambda done, of, left, at=number: update(at * of + done, STARTS * of, left))  # type: ignore[misc]
+        best, more = _polished(play, mean, min(blocks, steps))
+        found.append(mean if best is None else best)
+        failed.append(best is not None)
+        episodes += count + more
+    at = min(range(STARTS), key=lambda i: (not failed[i], float(np.linalg.norm(found[i]))))
+    distance = float(np.linalg.norm(found[at]))
+    return Likeliest(failed[at], found[at], distance, -0.5 * distance**2, float(norm.sf(distance)), episodes)
+
+
+def _polished(play: Noisy, mean: Array, blocks: int) -> tuple[Array | None, int]:
+    """Return the smallest noise (K, d) that fails, from a mean on, if any does, and the episodes that it took."""
+    best, episodes = _least(play, mean[None], 2.0 * SCALES)
+    for _ in range(POLISHED):
+        if best is None:
+            break
+        onward, count = _next(play, best, blocks)
+        tried, more = _least(play, best + LINE[:, None, None] * (onward - best), SCALES)
         episodes += count + more
         if tried is None or np.linalg.norm(tried) > (1.0 - LITTLE) * np.linalg.norm(best):
             break
         best = tried
-    found = mean if best is None else best
-    distance = float(np.linalg.norm(found))
-    return Likeliest(best is not None, found, distance, -0.5 * distance**2, float(norm.sf(distance)), episodes)
+    return best, episodes
 
 
 def _parts(steps: int, blocks: int) -> Array:
@@ -86,7 +99,7 @@ def _parts(steps: int, blocks: int) -> Array:
     return np.asarray(np.minimum(np.arange(steps) * blocks // steps, blocks - 1))
 
 
-def _moved(play: Noisy, steps: int, width: int, samples: int, rng: np.random.Generator, tell: Tell | None) -> tuple[Array, int]:
+def _moved(play: Noisy, steps: int, width: int, samples: int, rng: np.random.Generator, tell: Tell) -> tuple[Array, int]:
     """Return the mean (K, d) to which cross-entropy leads, and the episodes that it took."""
     blocks = min(COARSE, steps)
     block = _parts(steps, blocks)
@@ -96,9 +109,8 @@ def _moved(play: Noisy, steps: int, width: int, samples: int, rng: np.random.Gen
         margin, noise = play(np.broadcast_to(mean[block], (samples, steps, width)), keys, 1.0)
         sums = np.stack([noise[:, block == i].sum(axis=1) for i in range(blocks)], axis=1)
         ratio = 0.5 * float(np.sum(length * mean**2)) - np.sum(sums * mean, axis=(1, 2))
-        level = max(float(np.quantile(margin, ELITE)), 0.0)
-        if tell is not None:
-            tell(number + 1, ROUNDS, level)
+        level = max(float(np.quantile(margin, ELITE, method="higher")), 0.0)
+        tell(number + 1, ROUNDS, level)
         elite = margin <= level if level > 0.0 else margin < 0.0
         if not elite.any():  # no margin is finite
             return mean[block], (number + 1) * samples
@@ -116,11 +128,22 @@ def _alone(play: Noisy, means: Array) -> Array:
 
 def _least(play: Noisy, means: Array, scales: Array) -> tuple[Array | None, int]:
     """Return the smallest noise (K, d) that fails among means (M, K, d) times scales, if any does, and the episodes that it took."""
-    size = np.linalg.norm(means, axis=(1, 2))[:, None] * scales
-    margin = np.stack([_alone(play, scale * means) for scale in scales], axis=1)
-    size = np.where((margin < 0.0) & (size > 0.0), size, np.inf)
-    row, at = np.unravel_index(int(np.argmin(size)), size.shape)
-    return (scales[at] * means[row] if np.isfinite(size[row, at]) else None), size.size
+
+    def tried(some: Array, by: Array) -> tuple[Array, float]:
+        """Return the smallest that fails among `some` (M, K, d) times scales, and its scale; 0 if none does."""
+        margin = _alone(play, (by[:, None, None, None] * some).reshape(-1, *some.shape[1:])).reshape(len(by), -1)
+        size = np.where(margin.T < 0.0, np.linalg.norm(some, axis=(1, 2))[:, None] * by, np.inf)
+        row, at = np.unravel_index(int(np.argmin(size)), size.shape)
+        return some[row], float(by[at]) if np.isfinite(size[row, at]) else 0.0
+
+    if not means.any():
+        return None, 0
+    coarse, scale = tried(means, scales)
+    if not scale:
+        return None, scales.size * len(means)
+    gap = scales[1] - scales[0]
+    fine, finer = tried(coarse[None], scale - gap + gap * FINER)
+    return (finer or scale) * fine, scales.size * len(means) + FINER.size
 
 
 def _next(play: Noisy, mean: Array, blocks: int) -> tuple[Array, int]:
