@@ -10,7 +10,7 @@ import numpy as np
 
 from tailgate.base.errors import InputError
 from tailgate.core import Array, draws
-from tailgate.core.draws import Draws, Keys
+from tailgate.core.draws import Draws
 from tailgate.core.loop import Loop
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario, load_suite
@@ -111,27 +111,19 @@ class Case:
             return Choice(self.attack, genome)
         return Choice(self.arena.space.text(genome[: len(GENES)]), genome[len(GENES) :])
 
-    def robustness(self, genomes: Array, seeds: range) -> Array:
-        """Return the robustness (B, E) of each genome (B, genes) in each of the same episodes."""
-        count, each = len(seeds), episodes_at_once(self.own.model, self.own.horizon, AT_ONCE)
-        size, out = max(each // count, 1), []
-        for first in range(0, len(genomes), size):
-            some = genomes[first : first + size]
-            some = np.repeat(np.concatenate([some, np.repeat(some[-1:], size - len(some), axis=0)]), count, axis=0)
-            out.append(self.claim.robustness(self._played(some, seeds)))
-        return np.concatenate(out).reshape(-1, count)[: len(genomes)]
+    def robustness(self, genomes: Array, seeds: Array) -> Array:
+        """Return the robustness (B, E) of each genome (B, genes) in its episodes, which have the seeds (B, E)."""
+        rows, flat = np.repeat(genomes, seeds.shape[1], axis=0), seeds.ravel()
+        size, out = episodes_at_once(self.own.model, self.own.horizon, AT_ONCE), []
+        for first in range(0, len(rows), size):
+            part = slice(first, first + size)
+            out.append(self.claim.robustness(self._played(rows[part], flat[part])))
+        return np.concatenate(out).reshape(seeds.shape)
 
-    def _played(self, genomes: Array, seeds: range) -> Trace:
-        """Play genome i in episode i of the seeds, which are repeated."""
-        keys = keys_of(seeds, len(genomes))
+    def _played(self, genomes: Array, seeds: Array) -> Trace:
+        """Play genome i in the episode of seed i."""
+        keys = draws.keys(PURPOSE, seeds.tolist())
         if self.attack:
             return rollout(self.own, Spec("attack", self.attack).make(), Steered.of(keys, numbers_of(self.slots, genomes)))
         space, start = self.arena.space, genomes[:, len(GENES) :]
         return rollout(self.own, Many(space.rows(genomes[:, : len(GENES)])), Steered.of(keys, numbers_of(self.slots, start)))
-
-
-def keys_of(seeds: range, batch: int) -> Keys:
-    """Return keys of `batch` rows, which take the seeds in turn."""
-    held = draws.keys(PURPOSE, seeds)
-    places = np.arange(batch) % len(seeds)
-    return Keys(held.key[places], held.episode[places])

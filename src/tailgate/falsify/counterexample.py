@@ -10,9 +10,9 @@ import numpy as np
 
 from tailgate.base.errors import InputError
 from tailgate.base.reading import load_json
-from tailgate.core import Array
+from tailgate.core import Array, draws
 from tailgate.core.registry import Spec
-from tailgate.falsify.case import PURPOSE, Case, keys_of
+from tailgate.falsify.case import PURPOSE, Case
 from tailgate.falsify.claim import Claim
 from tailgate.falsify.road import Numbers, Steered, as_data, from_data, numbers_of
 from tailgate.falsify.schedule import Schedule, recorded
@@ -32,7 +32,7 @@ def _rows(numbers: Numbers, batch: int) -> Numbers:
 
 
 def _played(case: Case, attack: Any, text: str, seed: int, numbers: Numbers, batch: int = 1, plain: bool = True) -> Trace:
-    keys = Steered.of(keys_of(range(seed, seed + 1), batch), _rows(numbers, batch))
+    keys = Steered.of(draws.keys(PURPOSE, [seed] * batch), _rows(numbers, batch))
     return rollout(case.loop(text), attack, keys, plain=plain)
 
 
@@ -57,7 +57,7 @@ def counterexample(case: Case, worst: Worst) -> dict[str, Any]:
         return np.concatenate(out)
 
     if found["robustness"] < 0.0:
-        schedule = shrunk(schedule, broken)
+        schedule = shrunk(schedule, broken, case.own.brief)
     data = {
         "format": FORMAT, **{name: getattr(case, name) for name in FIELDS}, "threat": dict(case.threat), "property": case.formula,
         "purpose": PURPOSE, "seed": worst.seed, "start": as_data(numbers, 0), "found": found,

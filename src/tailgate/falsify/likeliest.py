@@ -17,9 +17,9 @@ from tailgate.core import Array
 
 ELITE = 0.1  # share of the samples that the next mean is made of
 STARTS = 3  # of the whole search: failures at other times are other minima
-ROUNDS = 40  # of cross-entropy, at most
+ROUNDS = 12  # of cross-entropy, at most
 COARSE = 10  # parts of the time over which its mean is constant: more would be noise
-POLISHED = 8  # steps along the gradient, at most
+POLISHED = 12  # steps along the gradient, at most
 NUDGE = 0.05  # of a difference, in standard deviations
 SCALES = np.arange(4, 13) / 8  # of a mean, for the least one that fails
 FINER = np.arange(1, 17) / 16  # between the least scale that fails and the one below
@@ -82,15 +82,14 @@ def likeliest(
 def _polished(play: Noisy, mean: Array, blocks: int) -> tuple[Array | None, int]:
     """Return the smallest noise (K, d) that fails, from a mean on, if any does, and the episodes that it took."""
     best, episodes = _least(play, mean[None], 2.0 * SCALES)
+    here = mean if best is None else best
     for _ in range(POLISHED):
-        if best is None:
-            break
-        onward, count = _next(play, best, blocks)
-        tried, more = _least(play, best + LINE[:, None, None] * (onward - best), SCALES)
+        onward, count = _next(play, here, blocks)
+        tried, more = _least(play, here + LINE[:, None, None] * (onward - here), SCALES)
         episodes += count + more
-        if tried is None or np.linalg.norm(tried) > (1.0 - LITTLE) * np.linalg.norm(best):
+        if best is not None and (tried is None or np.linalg.norm(tried) > (1.0 - LITTLE) * np.linalg.norm(best)):
             break
-        best = tried
+        best, here = tried, onward if tried is None else tried
     return best, episodes
 
 

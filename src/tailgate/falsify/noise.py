@@ -48,7 +48,8 @@ class Shifted(Keys):
         """Return keys with this mean, in the order of the slots."""
         out, at = Shifted(*keys), 0
         out.mean, out.size, out.places = mean, size, {}
-        out.noise = np.zeros(mean.shape)
+        idle = Keys(*keys).at(Role.POLICY, np.zeros(len(mean), np.int64))  # for what nobody draws: noise without effect
+        out.noise = mean + size * idle.normal(mean.shape[1:])
         for slot in slots:
             out.places[slot.role, slot.tag] = slice(at, at + slot.size)
             at += slot.size

@@ -30,7 +30,7 @@ from tailgate.falsify.splitting import Run, chance_of, check, plain_episodes, sp
 from tailgate.play.trace import episodes_at_once
 
 REPORT = "rare.json"
-SAMPLES, BLOCKS = 256, 30  # of the search for the likeliest failure
+SAMPLES, BLOCKS = 256, 60  # of the search for the likeliest failure
 SHOWN = 50  # levels that a bar counts; a run ends where it arrives
 Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
 

@@ -1,7 +1,7 @@
 """The search for the least robustness: generations that a sampler of Optuna proposes, each played in one batch.
 
-All trials of a generation meet the same episodes, and each generation meets fresh ones. A trial is worth its worst episode. Each finished
-generation may be kept; a search that goes on asks the sampler again, and compares what it proposes with what was kept.
+Each generation meets fresh episodes, and a trial is worth its worst one. Each finished generation may be kept; a search that goes on asks
+the sampler again, and compares what it proposes with what was kept.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def search(job: Search, out: Path | None = None, tell: Tell | None = None) -> Wo
     for number, first in enumerate(range(0, job.trials, GENERATION)):
         trials = [study.ask(distributions) for _ in range(min(GENERATION, job.trials - first))]
         genomes = np.array([[trial.params[name] for name in names] for trial in trials]).reshape(len(trials), len(names))
-        seeds = range(number * EPISODES, (number + 1) * EPISODES)
+        seeds = _seeds(job, number, len(trials))
         path = None if out is None else out / "generations" / f"{number:05d}.json"
         values = _kept(path, job, genomes)
         if values is None:
@@ -110,11 +110,23 @@ def search(job: Search, out: Path | None = None, tell: Tell | None = None) -> Wo
         for trial, value in zip(trials, values.min(axis=1).tolist(), strict=True):
             study.tell(trial, value)
         row, episode = np.unravel_index(int(np.argmin(values)), values.shape)
-        worst = min(worst, (float(values[row, episode]), genomes[row], seeds[int(episode)]), key=lambda one: one[0])
+        worst = min(worst, (float(values[row, episode]), genomes[row], int(seeds[row, episode])), key=lambda one: one[0])
         violations += int(np.count_nonzero(values < 0.0))
         if tell is not None:
             tell(first + len(trials), job.trials, worst[0])
     return Worst(worst[1], worst[2], worst[0], job.trials, job.trials * EPISODES, violations)
+
+
+def _seeds(job: Search, generation: int, trials: int) -> Array:
+    """Return the seeds (trials, E) of the episodes of a generation.
+
+    Scripts meet the same episodes, so that they can be compared. Starts of the road matter less than the chance that follows, so each
+    start meets episodes of its own.
+    """
+    if job.case.attack:
+        first = generation * GENERATION * EPISODES
+        return np.arange(first, first + trials * EPISODES).reshape(trials, EPISODES)
+    return np.repeat(np.arange(generation * EPISODES, (generation + 1) * EPISODES)[None], trials, axis=0)
 
 
 def _study(job: Search) -> Study:
