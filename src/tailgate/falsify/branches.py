@@ -1,7 +1,7 @@
 """Episodes whose random numbers come from other keys in each step: what splitting plays.
 
-A state depends on the keys up to its step alone. So two episodes with the same keys up to step k are one episode until then, and no state
-has to be kept: a branch is played from the start again, to the same bits.
+A state depends on the keys up to its step alone. So two episodes with the same keys up to a step are one episode until then. No state has
+to be kept: a branch is played from the start again, to the same bits.
 """
 
 from __future__ import annotations

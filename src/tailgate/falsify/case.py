@@ -47,7 +47,10 @@ class Choice(NamedTuple):
 
 @dataclass(frozen=True)
 class Case:
-    """What is to be broken. `attack` empty: scripts are searched; else this attack is played, and the road alone is searched."""
+    """A property and all that may break it.
+
+    With an empty `attack` scripts are searched. Else this attack is played, and the road alone is searched.
+    """
 
     suite: str
     scenario: str

@@ -2,7 +2,7 @@
 
 The normal draws of every step get a mean. The cross-entropy method moves it until a share of the samples fails; each sample counts by its
 likelihood ratio (Rubinstein and Kroese 2004). Then the mean is noise by itself, with no other noise. It is brought to the least size that
-fails, along the gradient of the margin: the iteration of Hasofer, Lind, Rackwitz and Fiessler (1978), with a search on each line.
+fails, along the gradient of the margin (Hasofer and Lind 1974, Rackwitz and Fiessler 1978). Each step searches a line.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ ROUNDS = 12  # of cross-entropy, at most
 COARSE = 10  # parts of the time over which its mean is constant: more would be noise
 POLISHED = 12  # steps along the gradient, at most
 NUDGE = 0.05  # of a difference, in standard deviations
+NUDGED = 256  # differences side by side; changes no result
 SCALES = np.arange(4, 13) / 8  # of a mean, for the least one that fails
 FINER = np.arange(1, 17) / 16  # between the least scale that fails and the one below
 LINE = np.arange(9) / 8  # between a mean and the next
@@ -149,10 +150,17 @@ def _next(play: Noisy, mean: Array, blocks: int) -> tuple[Array, int]:
     """Return the nearest noise (K, d) that fails if the margin is linear about this one, and the episodes that it took."""
     steps, width = mean.shape
     block = _parts(steps, blocks)
-    moves = NUDGE * (block[:, None] == np.arange(blocks))[:, :, None, None] * np.eye(width)[None, None]  # (K, blocks, d, d)
-    tried = mean + np.moveaxis(moves, 0, 2).reshape(blocks * width, steps, width)
-    margin = _alone(play, np.concatenate([mean[None], tried]))
-    slope = np.nan_to_num((margin[1:] - margin[0]) / NUDGE, posinf=0.0, neginf=0.0).reshape(blocks, width)
+    here, count = float(_alone(play, mean[None])[0]), blocks * width
+    margin = []
+    for first in range(0, count, NUDGED):
+        numbers = np.arange(first, min(first + NUDGED, count))
+        part, channel = np.divmod(numbers, width)
+        tried = np.repeat(mean[None], len(numbers), axis=0)
+        tried[np.arange(len(numbers)), :, channel] += NUDGE * (block == part[:, None])
+        margin.append(_alone(play, tried))
+    if not np.isfinite(here):
+        return mean, count + 1
+    slope = np.nan_to_num((np.concatenate(margin) - here) / NUDGE, posinf=0.0, neginf=0.0).reshape(blocks, width)
     slope = slope[block] / np.bincount(block, minlength=blocks)[block][:, None]  # of one step's noise
     steep = float(np.sum(slope**2))
-    return (mean if steep == 0.0 else (float(np.sum(slope * mean)) - margin[0]) / steep * slope), len(margin)
+    return (mean if steep == 0.0 else (float(np.sum(slope * mean)) - here) / steep * slope), count + 1

@@ -121,7 +121,7 @@ def _seeds(job: Search, generation: int, trials: int) -> Array:
     """Return the seeds (trials, E) of the episodes of a generation.
 
     Scripts meet the same episodes, so that they can be compared. Starts of the road matter less than the chance that follows, so each
-    start meets episodes of its own.
+    start meets other episodes.
     """
     if job.case.attack:
         first = generation * GENERATION * EPISODES

@@ -1,7 +1,7 @@
 """Adaptive multilevel splitting: the probability that a process reaches what it rarely does.
 
-Particles are paths of random keys, one key a step. The particles that came least far are replaced by copies of others, which go on with
-fresh keys from the step on at which they were farther. The estimate is unbiased for any number of particles and any measure of how far a
+Particles are paths of random keys, one key a step. Those that came least far are replaced by copies of others. A copy goes on
+with fresh keys from the step on at which it was farther. The estimate is unbiased for any number of particles and any measure of how far a
 path has come (Brehier, Gazeau, Goudenege, Lelievre and Rousset 2016). Several independent runs give an interval.
 """
 
@@ -52,7 +52,7 @@ class Chance(NamedTuple):
 
 
 def split(play: Play, steps: int, particles: int, rng: np.random.Generator, tell: Tell | None = None) -> Run:
-    """Estimate the probability that a margin falls below 0 within so many steps.
+    """Estimate the probability that a margin falls below 0 within these steps.
 
     Parameters
     ----------
