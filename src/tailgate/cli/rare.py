@@ -54,7 +54,7 @@ def _print(report: dict[str, Any]) -> None:
     )  # fmt: skip
     lost = report["runs"].count(0.0)
     if lost:
-        say(f"{lost} of {len(report['runs'])} runs did not arrive, or fell below 1e-15: the interval counts them as 0")
+        say(f"{lost} of {len(report['runs'])} runs did not arrive: the interval is that of plain episodes; more particles narrow it")
     if (found := report["likeliest"]) is None:
         return
     if not found["failed"]:

@@ -96,9 +96,9 @@ def estimate(job: Rare, out: Path | None = None, progress: Progress | None = Non
                     play, loop.horizon, job.particles, rng,
                     lambda level, p, left, at=number: update(f"run {at + 1}", min(level, SHOWN), SHOWN, f"P {p:.2g}, {left:.3g} to go"),  # type: ignore[misc]
                 )  # fmt: skip
-                held = {"probability": run.probability, "levels": run.levels, "episodes": run.episodes}
+                held = {"probability": run.probability, "levels": run.levels, "episodes": run.episodes, "first": run.first}
                 _keep(path, held | {"digest": job.digest("run")})
-            runs.append(Run(held["probability"], held["levels"], held["episodes"], np.zeros(0), np.zeros(0)))
+            runs.append(Run(held["probability"], held["levels"], held["episodes"], np.zeros(0), np.zeros(0), held["first"]))
             update("splitting", number + 1, job.runs, f"P {runs[-1].probability:.3g}")
         chance = chance_of(runs, job.particles, job.confidence)
         found = _noise(job, NoisyLoop(loop, attack, invariant, at_once), out, update) if noise else None

@@ -18,6 +18,7 @@ from scipy.stats import t as student
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
 from tailgate.core import Array
+from tailgate.trust.statistics import interval
 
 SHARE = 0.25  # of the particles that are replaced at a level, at least
 FLOOR = 1e-15  # a run that falls below this has not arrived
@@ -39,6 +40,7 @@ class Run(NamedTuple):
     episodes: int  # that were played, of K steps each
     keys: Array  # (K, M, 3) of the paths that arrived
     margins: Array  # (M,) their least margins
+    first: int = 0  # how many of the first particles arrived
 
 
 class Chance(NamedTuple):
@@ -75,6 +77,7 @@ def split(play: Play, steps: int, particles: int, rng: np.random.Generator, tell
     keys = _fresh(rng, steps, particles)
     margins = play(keys)
     reached, probability, levels, episodes = -margins.min(axis=0), 1.0, 0, particles
+    first = int(np.count_nonzero(reached > 0.0))
     while True:
         level = float(np.sort(reached)[max(int(SHARE * particles), 1) - 1])
         if level >= 0.0:
@@ -86,7 +89,7 @@ def split(play: Play, steps: int, particles: int, rng: np.random.Generator, tell
         if tell is not None:
             tell(levels, probability, -level)
         if probability < FLOOR:
-            return Run(0.0, levels, episodes, keys[:, :0], reached[:0])
+            return Run(0.0, levels, episodes, keys[:, :0], reached[:0], first)
         rows, parents = np.flatnonzero(lost), left[rng.integers(0, len(left), int(lost.sum()))]
         since = np.argmax(-margins[:, parents] > level, axis=0)  # the first step that was farther
         young = _fresh(rng, steps, len(rows))
@@ -95,7 +98,7 @@ def split(play: Play, steps: int, particles: int, rng: np.random.Generator, tell
         reached[rows] = -margins[:, rows].min(axis=0)
         episodes += len(rows)
     there = reached > 0.0
-    return Run(probability * float(there.mean()), levels, episodes, keys[:, there], -reached[there])
+    return Run(probability * float(there.mean()), levels, episodes, keys[:, there], -reached[there], first)
 
 
 def _fresh(rng: np.random.Generator, steps: int, count: int) -> Array:
@@ -125,25 +128,21 @@ def chance_of(runs: list[Run], particles: int, confidence: float = 0.95) -> Chan
     """Return the mean of independent runs, with a two-sided interval.
 
     The estimates of runs are nearly log-normal, so the interval is Cox's for the mean of a log-normal, with Student's quantile (Olsson
-    2005). If a run did not arrive, it is Student's about the mean, cut at 0. If none did, its upper end is that of plain episodes: all
-    first particles are such, and none arrived.
+    2005). If a run did not arrive, they are too few and too skewed for that. Then the interval is the exact one of plain episodes, which
+    the first particles of all runs are: wide, but it holds.
     """
     values = np.array([run.probability for run in runs])
     mean, count = float(values.mean()), len(values)
     quantile = float(student.ppf(0.5 + 0.5 * confidence, count - 1))
-    if not values.any():
-        low, high = 0.0, 1.0 - (1.0 - confidence) ** (1.0 / (particles * count))
-    elif (values == 0.0).any():
-        half = quantile * float(values.std(ddof=1)) / math.sqrt(count)
-        low, high = max(mean - half, 0.0), min(mean + half, 1.0)
+    if not values.all():
+        _, low, high = interval(sum(run.first for run in runs), particles * count, confidence)
     else:
         logs = np.log(values)
         variance = float(logs.var(ddof=1))
         middle = float(logs.mean()) + 0.5 * variance
         half = quantile * math.sqrt(variance / count + variance**2 / (2.0 * (count - 1)))
         low, high = math.exp(middle - half), min(math.exp(middle + half), 1.0)
-        low, high = min(low, mean), max(high, mean)
-    return Chance(mean, low, high, tuple(values.tolist()), sum(run.episodes for run in runs))
+    return Chance(mean, min(low, mean), max(high, mean), tuple(values.tolist()), sum(run.episodes for run in runs))
 
 
 def plain_episodes(chance: Chance, confidence: float = 0.95) -> float:
