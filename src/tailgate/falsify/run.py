@@ -39,9 +39,11 @@ def falsify(job: Search, out: Path | None = None, progress: Progress | None = No
     ------
     InputError
         Before anything is played, for an argument that makes no sense.
+    ImportError
+        Before anything is played, for a sampler that is not installed.
     """
     update, started = progress or (lambda *_: None), time.perf_counter()
-    job.case.check()
+    job.check()
     with contextlib.nullcontext() if out is None else alone(writable_directory(out)):
         worst = search(job, out, lambda done, total, least: update("falsify", done, total, f"least robustness {least:.4g}"))
         update("shrink", 0, 1, "")

@@ -55,6 +55,19 @@ class Search:
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or not 0 <= self.seed < 2**32:
             raise InputError("--seed", self.seed, "a whole number from 0 to 4294967295")
 
+    def check(self) -> None:
+        """Check all that could fail later.
+
+        Raises
+        ------
+        InputError
+            For anything that does not exist or has no meaning here.
+        ImportError
+            For a sampler that is not installed.
+        """
+        self.case.check()
+        _study(self)
+
     @property
     def digest(self) -> str:
         """A digest of all that decides what is found: the components and the code included."""
