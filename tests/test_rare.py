@@ -11,7 +11,7 @@ from tailgate.base.errors import InputError
 from tailgate.core import draws
 from tailgate.core.draws import Draws, Keys
 from tailgate.core.registry import Spec
-from tailgate.falsify import rare
+from tailgate.falsify import branches, rare
 from tailgate.falsify.branches import played
 from tailgate.falsify.case import Case
 from tailgate.falsify.claim import claim_of, invariant_of
@@ -141,6 +141,9 @@ def test_an_estimate_agrees_with_plain_episodes():
     plain = rollout(case.own, Spec("attack", "none").make(), draws.keys("report", range(20_000)))
     share = float((case.claim.robustness(plain) < 0.0).mean())
     assert 0.0005 < share < 0.02
+    failure = report["failure"]
+    again = played(case.own, Spec("attack", "none").make(), branches.from_data(failure["keys"], case.own.horizon), plain=True)
+    assert case.claim.robustness(again)[0] == failure["margin"] < 0.0
     assert report["low"] < share < report["high"] and 0.3 * share < report["probability"] < 3.0 * share
 
 

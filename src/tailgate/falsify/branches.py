@@ -6,6 +6,8 @@ to be kept: a branch is played from the start again, to the same bits.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from tailgate.core import Array, Attack
@@ -51,6 +53,20 @@ def _keys(key: Array) -> Keys:
 
 def _with_keys(state: LoopState, keys: Keys) -> LoopState:
     return state._replace(keys=keys)
+
+
+def as_data(keys: Array) -> list[list[int | str]]:
+    """Return the keys (K, 3) of a path as JSON data: the steps at which they change, and the keys from there on, in hexadecimal."""
+    changes = [0, *(np.flatnonzero(np.any(keys[1:] != keys[:-1], axis=1)) + 1).tolist()]
+    return [[k, *(f"{int(part):016x}" for part in keys[k])] for k in changes]
+
+
+def from_data(data: list[list[Any]], steps: int) -> Array:
+    """Return the keys (K, 1, 3) of a path that `as_data` wrote."""
+    out = np.zeros((steps, 1, 3), np.uint64)
+    for k, *parts in data:
+        out[k:, 0] = [int(part, 16) for part in parts]
+    return out
 
 
 class Branches:

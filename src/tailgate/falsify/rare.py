@@ -20,8 +20,9 @@ from tailgate.base.reading import load_json
 from tailgate.core.draws import Role
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
-from tailgate.core.schema import as_data, digest
-from tailgate.falsify.branches import Branches
+from tailgate.core.schema import as_data as plain_data
+from tailgate.core.schema import digest
+from tailgate.falsify.branches import Branches, as_data
 from tailgate.falsify.case import AT_ONCE, Case
 from tailgate.falsify.claim import invariant_of
 from tailgate.falsify.likeliest import Likeliest, likeliest
@@ -52,7 +53,7 @@ class Rare:
         """Return a digest of all that decides a part of the result."""
         one = self.case
         parts = [Spec("defence", one.defence).digest, Spec("attack", one.attack).digest, load_scenario(one.scenario).config_hash]
-        return digest([sources.own(), *parts, as_data(one), self.particles if what == "run" else None, self.seed, what])
+        return digest([sources.own(), *parts, plain_data(one), self.particles if what == "run" else None, self.seed, what])
 
 
 def estimate(job: Rare, out: Path | None = None, progress: Progress | None = None, noise: bool = False) -> dict[str, Any]:
@@ -71,7 +72,9 @@ def estimate(job: Rare, out: Path | None = None, progress: Progress | None = Non
     -------
     dict
         `probability` with `low` and `high`; `runs`, the estimate of each; `episodes` that were played, and `plain_episodes` that would
-        give an interval as narrow. `likeliest`: the noise in standard deviations and its log-likelihood over that of no noise.
+        give an interval as narrow.
+        `failure`: an episode that broke the invariant, as keys that `tailgate.falsify.branches` plays.
+        `likeliest`: the noise in standard deviations and its log-likelihood over that of no noise.
 
     Raises
     ------
@@ -86,7 +89,7 @@ def estimate(job: Rare, out: Path | None = None, progress: Progress | None = Non
     attack, at_once = Spec("attack", job.case.attack).make(), episodes_at_once(job.case.own.model, job.case.own.horizon, AT_ONCE)
     play = Branches(loop, attack, invariant, at_once)
     with contextlib.nullcontext() if out is None else alone(writable_directory(out)):
-        runs = []
+        runs, failures = [], []
         for number in range(job.runs):
             path = None if out is None else out / "runs" / f"{number:03d}.json"
             held = _kept(path, job.digest("run"))
@@ -96,9 +99,16 @@ def estimate(job: Rare, out: Path | None = None, progress: Progress | None = Non
                     play, loop.horizon, job.particles, rng,
                     lambda level, p, left, at=number: update(f"run {at + 1}", min(level, SHOWN), SHOWN, f"P {p:.2g}, {left:.3g} to go"),  # type: ignore[misc]
                 )  # fmt: skip
-                held = {"probability": run.probability, "levels": run.levels, "episodes": run.episodes, "first": run.first}
+                held = {
+                    "probability": run.probability,
+                    "levels": run.levels,
+                    "episodes": run.episodes,
+                    "first": run.first,
+                    "failure": _failure(run),
+                }
                 _keep(path, held | {"digest": job.digest("run")})
             runs.append(Run(held["probability"], held["levels"], held["episodes"], np.zeros(0), np.zeros(0), held["first"]))
+            failures += [held["failure"]] if held["failure"] else []
             update("splitting", number + 1, job.runs, f"P {runs[-1].probability:.3g}")
         chance = chance_of(runs, job.particles, job.confidence)
         found = _noise(job, NoisyLoop(loop, attack, invariant, at_once), out, update) if noise else None
@@ -108,10 +118,19 @@ def estimate(job: Rare, out: Path | None = None, progress: Progress | None = Non
             "confidence": job.confidence, "probability": chance.probability, "low": chance.low, "high": chance.high,
             "runs": list(chance.runs), "levels": [run.levels for run in runs], "episodes": chance.episodes,
             "plain_episodes": _finite(plain_episodes(chance, job.confidence)), "likeliest": found,
+            "failure": min(failures, key=lambda one: one["margin"], default=None),
             "seconds": round(time.perf_counter() - started, 2),
         }  # fmt: skip
         _keep(None if out is None else out / REPORT, report)
     return report
+
+
+def _failure(run: Run) -> dict[str, Any] | None:
+    """Return the path of a run that arrived with the least margin, as JSON data."""
+    if not len(run.margins):
+        return None
+    at = int(np.argmin(run.margins))
+    return {"margin": float(run.margins[at]), "keys": as_data(run.keys[:, at])}
 
 
 def _finite(value: float) -> float | None:
