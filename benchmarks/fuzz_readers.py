@@ -170,6 +170,15 @@ def _trust_files() -> list[bytes]:
     return [json.dumps(check(suite, runs=20)).encode()]
 
 
+def _counterexamples() -> list[bytes]:
+    from tailgate.falsify.case import Case
+    from tailgate.falsify.run import falsify
+    from tailgate.falsify.search import Search
+
+    cases = (Case("", "linear-dos-v0", 8, "kf", (), "G error < 3", attack) for attack in ("none", "dropout:start_step=20"))
+    return [json.dumps(falsify(Search(case, trials=2))["counterexample"]).encode() for case in cases]
+
+
 CARD = {
     "kind": "defence", "text": "kf", "name": "Kalman", "authors": "A, B", "reference": "doi", "code": "https://example.org", "licence": "MIT",
     "uses": ["measurements"], "threat_model": "any", "training": "none", "digest": "",
@@ -373,6 +382,8 @@ def readers() -> dict[str, Reader]:
         Reader("checkpoint of ppo", "tensors", "checkpoint.safetensors", *ppo, slow=2.0),
         Reader("run's configuration", "json", "config.json", _started, _resumed),
         Reader("run's curve", "json", "curve-0.json", lambda: [b'{"curve": [], "seconds": 12.5}'], _call("training.trainings", "spent", "curve-0.json")),
+        Reader("counterexample", "json", "counterexample.json", _counterexamples,
+               _call("falsify.counterexample", "replayed", "counterexample.json", "kf"), command=("falsify", "kf", "--counterexample", "{}"), slow=5.0),
         Reader("card", "json", "card.json", lambda: [json.dumps(CARD).encode()], _call("board.card", "read_card", "card.json")),
         Reader("step times", "json", "step_time.json", _files("results/quick-v0/step_time.json"),
                _call("board.attachments", "Clock.read", "step_time.json")),

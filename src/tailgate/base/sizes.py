@@ -16,7 +16,7 @@ from pydantic import Field
 from tailgate.base.errors import InputError
 
 LIMITS = {
-    "workers": 1024, "threads": 1024, "rounds": 100_000, "trials": 100_000,
+    "workers": 1024, "threads": 1024, "rounds": 100_000, "trials": 100_000, "particles": 1_000_000,
     "seeds": 10_000_000, "episodes": 10_000_000, "runs": 10_000_000, "sample": 1_000_000_000, "onsets": 10_000_000, "most": 1_000_000,
     "batch": 1_000_000, "num_envs": 10_000_000, "steps": 100_000_000_000,
 }  # fmt: skip

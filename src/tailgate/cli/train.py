@@ -120,7 +120,7 @@ def _page(config: TrainConfig, report: dict[str, Any]) -> Path:
 
 
 def _learned(config: TrainConfig, report: dict[str, Any], rows: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """Return what the page shows of the first policy, with a replay of its worst episode with the page."""
+    """Return what the page shows of the first policy, and write a replay of its worst episode."""
     from tailgate.replay.page import write_page
     from tailgate.replay.replay import Filter, choose, play
     from tailgate.site.learned import learned

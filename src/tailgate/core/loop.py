@@ -49,7 +49,7 @@ from tailgate.core.threat import Brief, ThreatModel
 from tailgate.engine.array import Traced
 
 PERFECT = Link()
-_START = np.uint32(0xFFFFFFFF)  # the step under which start() draws: no episode reaches it
+START = np.uint32(0xFFFFFFFF)  # the step under which start() draws: no episode reaches it
 
 
 def check_estimate(estimate: Estimate, model: Model, batch: int, k: Array) -> None:
@@ -166,7 +166,7 @@ class Loop:
         """Return the states of B fresh episodes at k = 1, measured."""
         plan, model = self.plan, self.model
         batch = len(keys.key)
-        at_start = np.full(batch, _START)
+        at_start = np.full(batch, START)
         plant = self.plant.start(plan.plant, keys.at(Role.PRIOR, at_start))
         controller = self.controller.start(plan.controller, batch)
         held = self.controller.held(plan.controller, controller, batch)

@@ -243,8 +243,13 @@ def holds(formula: Formula, samples: Samples) -> Array:
 
 def robustness(formula: Formula, samples: Samples) -> Array:
     """Return (B,) of each episode: above 0 where the formula holds, below where it does not [unit of the atom that decides]."""
+    return np.asarray(robustness_along(formula, samples)[0])
+
+
+def robustness_along(formula: Formula, samples: Samples) -> Array:
+    """Return (K, B): the robustness read at every sample; samples after an episode's end say nothing."""
     _check(formula, samples, 0)
-    return np.asarray(_value(formula, samples, _ROBUST)[0])
+    return _value(formula, samples, _ROBUST)
 
 
 def along(formula: Formula, samples: Samples) -> Array:
