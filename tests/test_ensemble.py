@@ -17,6 +17,7 @@ from tailgate.engine.agreement import Untraced
 from tailgate.ensemble import members, networks, standard
 from tailgate.ensemble import search as searching
 from tailgate.ensemble.battery import Played, Scripts, battery_of, played_plainly, remembered
+from tailgate.ensemble.gradient import Pace
 from tailgate.ensemble.members import Budget
 from tailgate.ensemble.networks import Learner, Race, learned, starts_of
 from tailgate.ensemble.search import Arena, Effort, search
@@ -205,7 +206,7 @@ def test_policies_are_learned(tmp_path, monkeypatch):
 
 @pytest.fixture
 def small(monkeypatch):
-    monkeypatch.setitem(members.BUDGETS, "quick", Budget(SMALL, SMALL, 6, ((2, 8), (1, 8))))
+    monkeypatch.setitem(members.BUDGETS, "quick", Budget(SMALL, SMALL, 6, ((2, 8), (1, 8)), Pace(16, 1, 1, 8)))
     monkeypatch.setattr(networks, "JUDGED", 64)
     monkeypatch.setattr(members, "FINALISTS", 1)
     for name, value in (("FINAL", 16), ("MORE", 8), ("KEPT", 8)):
@@ -249,16 +250,17 @@ def test_the_command(small, tmp_path, capsys, monkeypatch):
     assert json.loads((tmp_path / "attack.json").read_text()) == report
     attacks = (tmp_path / "attacks.txt").read_text().splitlines()
     own = {one["member"]: one for one in cell["members"]}
-    assert list(own) == ["scripts", "programs", "transfer", "networks", "grey networks", "white box"]
-    assert attacks == [one["attack"] for one in own.values()] and cell["found"]["attack"] in attacks
-    assert [one["knowledge"] for one in own.values()] == ["black"] * 4 + ["grey", "white"]
+    assert list(own) == ["scripts", "programs", "transfer", "networks", "grey networks", "white box", "gradient"]
+    assert attacks == [one["attack"] for one in own.values() if one["attack"]] and cell["found"]["attack"] in attacks
+    assert [one["knowledge"] for one in own.values()] == ["black"] * 4 + ["grey", "white", "white"]
     assert own["programs"]["attack"].startswith("program:path=") and own["networks"]["attack"].startswith("policy:path=")
     evaluate = ["evaluate", "--suite", "radar-v0", "--scenario", "radar-braking-v0", "--dose", "4", "--defence", "chi2_kf", "--seeds", "20"]
     evaluate += [word for attack in attacks for word in ("--attack", attack)]
     assert main([*evaluate, "--out", str(tmp_path / "again.jsonl")]) == 0
     rows = [json.loads(line) for line in (tmp_path / "again.jsonl").read_text().splitlines()]
+    assert own["gradient"]["why"] == "the threat model grants nothing for it"
     for one in own.values():
-        assert sum(row["crashed"] for row in rows if row["attack"] == one["attack"]) / 20 == one["damage"]
+        assert one["attack"] is None or sum(row["crashed"] for row in rows if row["attack"] == one["attack"]) / 20 == one["damage"]
     monkeypatch.setattr(standard, "searched", lambda *_: pytest.fail("searched again"))
     assert main([*WORDS, "--out", str(tmp_path)]) == 0
     assert "best of the suite" in capsys.readouterr().out

@@ -206,13 +206,13 @@ def test_the_search_is_repeatable_and_its_file_is_an_attack(tmp_path, capsys, mo
     for name in ("FINAL", "COMPARED"):
         monkeypatch.setattr(f"tailgate.ensemble.gradient.{name}", 32)
     found = [gradient(ARENA, TINY, tmp_path / name, 3, lambda *one: told.append(one)) for name in ("a", "b")]
-    assert [one._replace(script="") for one in found[0]] == [one._replace(script="") for one in found[1]]
+    assert [one._replace(attack="") for one in found[0]] == [one._replace(attack="") for one in found[1]]
     files = [next((tmp_path / name).glob("*.yaml")) for name in ("a", "b")]
-    assert files[0].read_bytes() == files[1].read_bytes() and str(files[0]) == found[0][0].script
+    assert files[0].read_bytes() == files[1].read_bytes() and f"program:path={files[0]}" == found[0][0].attack
     assert [(n, of) for n, of, *_ in told[:2]] == [(1, 2), (2, 2)]
     rows = tmp_path / "rows.jsonl"
     command = ["evaluate", "--scenario", "braking-v0", "--threat", "kinds=[fdi]", "--threat", "fdi_bound=3.0", "--threat", "budget=20"]
-    assert main([*command, "--defence", "kf", "--attack", found[0][0].script, "--seeds", "2", "--out", str(rows)]) == 0
+    assert main([*command, "--defence", "kf", "--attack", found[0][0].attack, "--seeds", "2", "--out", str(rows)]) == 0
     played = [json.loads(line) for line in rows.read_text().splitlines()]
     assert len(played) == 2 and all(row["status"] == "ok" and row["attack_steps"] > 0 for row in played), capsys.readouterr()
 

@@ -18,6 +18,7 @@ import numpy as np
 from tailgate.base.errors import InputError
 from tailgate.core import Array, Kind, draws
 from tailgate.core.draws import Keys
+from tailgate.core.schema import as_data, digest
 from tailgate.ensemble.schedule import Schedule, Scheduled, schedule_of
 from tailgate.ensemble.search import FINAL, FIRST, MORE, Arena, Found
 from tailgate.ensemble.space import GENES
@@ -55,7 +56,6 @@ class Pace:
                 raise InputError(f"pace.{name}", value, "a whole number, at least 1")
 
 
-PACES = {"quick": Pace(512, 2, 16, 128), "standard": Pace(2048, 4, 40, 256)}
 
 
 def smooth_damage(path: Course, follows: bool, bound: float | None) -> torch.Tensor:
@@ -200,7 +200,7 @@ def gradient(arena: Arena, pace: Pace, out: Path, seed: int = 0, tell: Tell | No
     Returns
     -------
     list of Found
-        Each `script` is the path of a program. Empty where the threat model does not grant false data.
+        Each `attack` names the file of a program. Empty where the threat model does not grant false data.
 
     Raises
     ------
@@ -215,7 +215,8 @@ def gradient(arena: Arena, pace: Pace, out: Path, seed: int = 0, tell: Tell | No
     keys = draws.keys("tune", range(after, after + pace.episodes))
     for number, start in enumerate(starts(arena, pace, seed, scripts)):
         injection = Injection(arena.loop, start.when())
-        path = out / f"gradient-{arena.scenario}-{'own' if arena.dose is None else arena.dose}-{arena.defence}-{number}.yaml"
+        name = f"{arena.scenario}-{'own' if arena.dose is None else arena.dose}-gradient-{digest([as_data(arena), seed, number])}.yaml"
+        path = out / name
 
         def say(turn: int, damage: float, number: int = number, path: Path = path) -> None:
             if tell is not None:
@@ -227,7 +228,7 @@ def gradient(arena: Arena, pace: Pace, out: Path, seed: int = 0, tell: Tell | No
             end.write(path, brief, f"Found by gradients against {arena.defence} in {arena.scenario}.")
             scores.append(arena.confirmed(str(path), "tune", after + pace.episodes, COMPARED)[1])
         ends[int(np.argmax(scores))].write(path, brief, f"Found by gradients against {arena.defence} in {arena.scenario}.")
-        found.append(Found(str(path), *arena.confirmed(str(path), "select", 0, FINAL), FINAL))
+        found.append(Found(f"program:path={path}", *arena.confirmed(str(path), "select", 0, FINAL), FINAL))
     return sorted(found, key=lambda one: -one.score)
 
 
@@ -246,13 +247,13 @@ def starts(arena: Arena, pace: Pace, seed: int, scripts: Sequence[str] = ()) -> 
     rng = np.random.default_rng([seed, zlib.crc32(f"gradient/{arena.scenario}/{arena.dose}/{arena.defence}".encode())])
     genomes = rng.random((pace.scripts, len(GENES)))
     genomes[:, 0] = (np.array(families)[np.arange(pace.scripts) % len(families)] + 0.5) / len(space.families)
-    rows = space.rows(genomes)
-    total = arena.scores(rows, 0, FIRST)
+    many = space.scripts(genomes)
+    total = arena.scores(many, 0, FIRST)
     best = np.argsort(-total, kind="stable")[: pace.starts * 8]
-    again = total[best] + arena.scores(rows.take(best), FIRST, MORE)
+    again = total[best] + arena.scores(many.take(best), FIRST, MORE)
     out: dict[int, Schedule] = {}
     for i in best[np.argsort(-again, kind="stable")].tolist():
-        out.setdefault(int(rows.trigger[i]), schedule_of(space.text(genomes[i]), brief))
+        out.setdefault(int(many.phases[0].trigger[i]), schedule_of(space.text(genomes[i]), brief))
     return [*given, *out.values()][: pace.starts]
 
 

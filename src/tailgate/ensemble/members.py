@@ -12,6 +12,7 @@ import numpy as np
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array
 from tailgate.core.registry import entries
+from tailgate.ensemble.gradient import Pace, gradient
 from tailgate.ensemble.networks import PUBLISHED, Phase, Race, learned, transferred
 from tailgate.ensemble.search import FINALISTS, Arena, Effort, Found, Tell, search
 
@@ -27,6 +28,7 @@ class Budget:
     programs: Effort
     population: int  # of a generation of policies
     phases: tuple[tuple[int, int], ...]  # of the race of policies: generations, and episodes of each member
+    pace: Pace  # of the gradient attack
 
     @property
     def race(self) -> Race:
@@ -39,8 +41,8 @@ class Budget:
 
 
 BUDGETS = {
-    "quick": Budget(Effort(512, 5), Effort(256, 4), 32, ((20, 32), (20, 64))),
-    "standard": Budget(Effort(2048, 12), Effort(1024, 10), 64, ((40, 32), (40, 64), (60, 128))),
+    "quick": Budget(Effort(512, 5), Effort(256, 4), 32, ((20, 32), (20, 64)), Pace(256, 1, 8, 64)),
+    "standard": Budget(Effort(2048, 12), Effort(1024, 10), 64, ((40, 32), (40, 64), (60, 128)), Pace(2048, 2, 20, 128)),
 }
 
 
@@ -103,6 +105,12 @@ def _white_box(hunt: Hunt) -> list[str]:
     return out
 
 
+def _gradient(hunt: Hunt) -> list[str]:
+    """Follow the derivatives of the closed loop, from the best scripts of false data."""
+    scripts = [one.attack for one in hunt.found.get("scripts", []) if one.attack.partition(":")[0] in ("fdi", "fdi_ramp")]
+    return [one.attack for one in gradient(hunt.arena, hunt.budget.pace, hunt.folder / "programs", hunt.seed, None, scripts)]
+
+
 class Member(NamedTuple):
     """A way to find attacks, and what the attacks know."""
 
@@ -118,6 +126,7 @@ MEMBERS = (
     Member("networks", "black", lambda hunt: _policies(hunt, "black")),
     Member("grey networks", "grey", lambda hunt: _policies(hunt, "grey")),
     Member("white box", "white", _white_box),
+    Member("gradient", "white", _gradient),
 )
 
 
@@ -138,7 +147,7 @@ def harvest(hunt: Hunt) -> list[Harvest]:
         try:
             found = hunt.arena.best(member.find(hunt))
             why = "" if found else "the threat model grants nothing for it"
-        except NotApplicable as error:
+        except (NotApplicable, ImportError) as error:
             why = str(error)
         hunt.found[member.name] = found
         out.append(Harvest(member.name, member.knowledge, found, why))

@@ -9,15 +9,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tailgate.base.errors import InputError
-from tailgate.core import Array, draws
+from tailgate.core import Array, Command, View, draws
 from tailgate.core.draws import Draws
 from tailgate.core.loop import Loop
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario, load_suite
 from tailgate.core.threat import Brief
-from tailgate.ensemble.battery import Memory, Scripts
+from tailgate.ensemble.battery import Memory, Scripts, remembered
 from tailgate.ensemble.search import Arena
-from tailgate.ensemble.space import GENES, Rows
+from tailgate.ensemble.space import GENES, Sequence
 from tailgate.falsify.claim import Claim, claim_of
 from tailgate.falsify.road import Slot, Steered, numbers_of, slots_of
 from tailgate.play.trace import Trace, episodes_at_once, rollout
@@ -26,16 +26,23 @@ PURPOSE = "tune"  # of the episodes' seeds
 AT_ONCE = 1024  # episodes side by side; changes no result
 
 
-class Many(Scripts):
+class Many:
     """An attack whose row i plays script i of a list."""
 
-    def __init__(self, rows: Rows) -> None:
-        self.rows = rows
+    def __init__(self, scripts: Sequence) -> None:
+        self.scripts, self._attack = scripts, Scripts()
+
+    def prepare(self, brief: Brief) -> Brief:
+        """Return the brief."""
+        return brief
 
     def start(self, plan: Brief, batch: int, draws: Draws) -> Memory:
         """Return the memory of B scripts; a smaller or larger batch takes them in turn."""
-        rows = self.rows.take(np.arange(batch) % len(self.rows.kind))
-        return Memory(rows, np.zeros(batch, bool), np.zeros(batch, np.int64), np.full((batch, plan.model.agents), -np.inf))
+        return remembered(self.scripts.take(np.arange(batch) % len(self.scripts.length)), plan.model.agents)
+
+    def decide(self, plan: Brief, memory: Memory, view: View, draws: Draws) -> tuple[Memory, Command]:
+        """Return the next memory and the commands of each script."""
+        return self._attack.decide(plan, memory, view, draws)
 
 
 class Choice(NamedTuple):
@@ -129,4 +136,4 @@ class Case:
         if self.attack:
             return rollout(self.own, Spec("attack", self.attack).make(), Steered.of(keys, numbers_of(self.slots, genomes)))
         space, start = self.arena.space, genomes[:, len(GENES) :]
-        return rollout(self.own, Many(space.rows(genomes[:, : len(GENES)])), Steered.of(keys, numbers_of(self.slots, start)))
+        return rollout(self.own, Many(space.scripts(genomes[:, : len(GENES)])), Steered.of(keys, numbers_of(self.slots, start)))
