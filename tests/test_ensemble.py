@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -207,7 +208,8 @@ def test_policies_are_learned(tmp_path, monkeypatch):
 @pytest.fixture
 def small(monkeypatch):
     monkeypatch.setitem(members.BUDGETS, "quick", Budget(SMALL, SMALL, 6, ((2, 8), (1, 8)), Pace(16, 1, 1, 8)))
-    monkeypatch.setattr(networks, "JUDGED", 64)
+    for name, value in (("JUDGED", 64), ("SHOWN", 8), ("COPIED", 64)):
+        monkeypatch.setattr(networks, name, value)
     monkeypatch.setattr(members, "FINALISTS", 1)
     for name, value in (("FINAL", 16), ("MORE", 8), ("KEPT", 8)):
         monkeypatch.setattr(searching, name, value)
@@ -301,3 +303,16 @@ def test_another_defence_of_the_same_name_is_searched_again(tmp_path, monkeypatc
         (job,) = standard.jobs_of(load_suite("radar-v0"), "edited_defence:Mine", ["radar-braking-v0"], [4], "quick", 0)
         names.append(job.name)
     assert names[0] != names[1]
+
+
+def test_a_class_of_ones_own_is_attacked(small, tmp_path, monkeypatch, capsys):
+    """The file of a policy does not name it, so that nobody who reads the file imports it."""
+    (tmp_path / "attacked_defence.py").write_text("from tailgate.estimators import GatedKalman\n\n\nclass Mine(GatedKalman):\n    pass\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(members, "MEMBERS", [one for one in members.MEMBERS if one.name in ("scripts", "networks")])
+    assert main([WORDS[0], "attacked_defence:Mine", *WORDS[2:], "--out", "found", "--json"]) == 0
+    (cell,) = json.loads(capsys.readouterr().out)["cells"]
+    scripts, networks = cell["members"]
+    assert scripts["attack"] and networks["attack"].startswith("policy:path=found")
+    assert "attacked_defence" not in Path(networks["attack"].partition("=")[2]).read_text()

@@ -11,12 +11,14 @@ import numpy as np
 
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array
-from tailgate.core.registry import entries
+from tailgate.core.registry import Spec, entries
+from tailgate.core.schema import fields_of
 from tailgate.ensemble.gradient import Pace, gradient
 from tailgate.ensemble.networks import PUBLISHED, Phase, Race, learned, transferred
 from tailgate.ensemble.search import FINALISTS, Arena, Effort, Found, Tell, search
 
 IMITATED = 2  # scripts that networks imitate at the start
+OPENED = (0.1, 0.25, 0.5, 0.75)  # of the range of gaps: where white boxes begin
 STARTS = 1 + IMITATED + PUBLISHED  # of a race of policies, at most
 
 
@@ -92,16 +94,19 @@ def _transfer(hunt: Hunt) -> list[str]:
 
 
 def _white_box(hunt: Hunt) -> list[str]:
-    """Play the attacks that know the defence's state, as they come."""
-    out = []
+    """Play the attacks that know the defence's state: at once, and from several gaps on."""
+    out, (low, high) = [], hunt.arena.space.road.get("near", (0.0, 0.0))
+    opened = [f"trigger=near,threshold={low + share * (high - low):.4g}" for share in OPENED] if high > low else []
     for name, entry in entries("attack").items():
-        if entry.knowledge == "white":
+        if entry.knowledge != "white":
+            continue
+        for text in (name, *(f"{name}:{words}" for words in opened if "trigger" in fields_of(entry.cls))):
             try:
-                attack = entry.cls()
+                attack = Spec("attack", text).make()
                 attack.prepare(hunt.arena.seat("white", attack).brief)
             except (NotApplicable, InputError):
                 continue
-            out.append(name)
+            out.append(text)
     return out
 
 

@@ -43,7 +43,7 @@ SPREAD = 0.3  # of the first generation: of the size of a network's weights, and
 RAMP = (1, 3, 9)  # steps of a ramp whose sizes a policy may send
 COPIED = 1024  # decisions of a script in a step of its imitation
 JUDGED = 1024  # episodes that decide which starts go on, for a system of one agent
-FEWEST = 8  # episodes that a member plays, at least
+LEAST, FEWEST = 16, 8  # policies of a generation, and episodes that each plays, at least
 FIRST = 1 << 30  # number of the first episode that starts are judged on: no search meets it before
 PUBLISHED = 2  # policies of the zoo that join, at most
 
@@ -59,15 +59,19 @@ class Phase(NamedTuple):
 class Race:
     """The size of a search of policies."""
 
-    population: int
+    population: int  # for a system of one agent
     phases: tuple[Phase, ...]
 
+    def members(self, agents: int) -> int:
+        """Return the policies of a generation."""
+        return max(self.population // agents, min(LEAST, self.population))
+
     def episodes(self, starts: int, agents: int) -> int:
-        """Return the episodes that a race of so many starts plays."""
+        """Return the episodes that a race plays."""
         total, judged = starts * JUDGED // agents, JUDGED // agents
         for phase in self.phases:
             each = max(phase.episodes // agents, FEWEST)
-            total += starts * (phase.generations * each * self.population + judged)
+            total += starts * (phase.generations * each * self.members(agents) + judged)
             starts = math.ceil(starts / 2)
         return total
 
@@ -149,10 +153,12 @@ class Learner:
         """Write the champion below a folder; return it as an attack on the command line."""
         plan, arena = self.start.plan, self.arena
         weights, biases = zip(*self.shape.layers(self.champion[1]), strict=True)
-        training = {
+        training: dict[str, Any] = {
             "summary": "learned by the standard attack ensemble", "start": self.start.name, "seed": seed, "episodes": self.episode,
-            "config": {"scenario": arena.scenario, "defence": arena.defence, "threat": dict(arena.threat)},
+            "config": {"scenario": arena.scenario, "threat": dict(arena.threat)},
         }  # fmt: skip
+        if not Spec("defence", arena.defence).imports:  # a file shall not name somebody's class
+            training["config"]["defence"] = arena.defence
         header = header_of(Seat(self.loop, plan.action, plan.observation, Reward(), {}), training)
         knowledge, dose = self.loop.threat.knowledge, "own" if arena.dose is None else arena.dose
         name = f"{arena.scenario}-{dose}-{knowledge}-{digest([as_data(arena), self.start.name, seed])}"
@@ -232,7 +238,8 @@ def learned(
     NotApplicable
         Where the defence is not traced, as a policy would be learned too slowly, and where there is nothing to choose.
     """
-    runs = [Learner(arena, knowledge, start, race.population, seed) for start in starts_of(arena, knowledge, scripts, seed)]
+    members = race.members(arena.loop.model.agents)
+    runs = [Learner(arena, knowledge, start, members, seed) for start in starts_of(arena, knowledge, scripts, seed)]
     left, total, done = list(runs), sum(phase.generations for phase in race.phases), 0
     for phase in race.phases:
         episodes = max(phase.episodes // arena.loop.model.agents, FEWEST)

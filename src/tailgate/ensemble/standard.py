@@ -214,7 +214,8 @@ def _kept(job: Job, out: Path | None) -> dict[str, Any] | None:
         held = load_json(path)
     except (OSError, ValueError) as error:
         raise InputError("--out", str(path), f"the result of a search; remove the file to search again ({error})") from None
-    files = [Path(text.partition("path=")[2]) for text in _chosen(held) if text.startswith(("program:", "policy:"))]
+    texts = [found["attack"] for one in held["members"] for found in one["found"]]
+    files = [Path(text.partition("path=")[2]) for text in texts if text.startswith(("program:", "policy:"))]
     return held if all(file.is_file() for file in files) else None  # a file that was removed is made again
 
 
