@@ -112,8 +112,11 @@ def _white_box(hunt: Hunt) -> list[str]:
 
 def _gradient(hunt: Hunt) -> list[str]:
     """Follow the derivatives of the closed loop, from the best scripts of false data."""
+    agents = hunt.arena.loop.model.agents
+    if agents > 1:
+        raise NotApplicable("agents", agents, "1: a gradient through a loop of several takes half a minute")
     scripts = [one.attack for one in hunt.found.get("scripts", []) if one.attack.partition(":")[0] in ("fdi", "fdi_ramp")]
-    return [one.attack for one in gradient(hunt.arena, hunt.budget.pace, hunt.folder / "programs", hunt.seed, None, scripts)]
+    return [one.attack for one in gradient(hunt.arena, hunt.budget.pace, hunt.folder / "programs", hunt.seed, hunt.tell, scripts)]
 
 
 class Member(NamedTuple):
