@@ -1,7 +1,6 @@
 """Falsification: the road as a vector, the search, the shrinking, the counterexample's file, splitting and the likeliest failure."""
 
 import dataclasses
-import importlib.util
 import json
 from pathlib import Path
 
@@ -88,9 +87,7 @@ def test_a_road_alone_is_worse_than_as_many_random_ones():
     assert (found.trials, found.episodes) == (192, 1536)
 
 
-@pytest.mark.parametrize("sampler", [
-    "tpe", pytest.param("cmaes", marks=pytest.mark.skipif(importlib.util.find_spec("cmaes") is None, reason="no package cmaes")),
-])  # fmt: skip
+@pytest.mark.parametrize("sampler", ["tpe", "cmaes"])
 def test_an_interrupted_search_finds_the_same(tmp_path, monkeypatch, sampler):
     job = Search(ROAD, sampler, 3 * search.GENERATION, 5)
     whole = search.search(job)

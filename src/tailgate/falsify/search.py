@@ -6,7 +6,6 @@ the sampler again, and compares what it proposes with what was kept.
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
 import warnings
@@ -104,7 +103,7 @@ def search(job: Search, out: Path | None = None, tell: Tell | None = None) -> Wo
     InputError
         If the folder holds generations of another search.
     ImportError
-        Without Optuna, and for `cmaes` without that package.
+        Without Optuna (extra `tune`).
     """
     study, names = _study(job), job.case.genes
     distributions = {name: optuna().distributions.FloatDistribution(0.0, 1.0) for name in names}
@@ -148,8 +147,6 @@ def _study(job: Search) -> Study:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", module.exceptions.ExperimentalWarning)
         if job.sampler == "cmaes":
-            if importlib.util.find_spec("cmaes") is None:
-                raise ImportError("sampler cmaes needs a package: pip install 'tailgate[tune]'; --sampler tpe does without")
             chosen: Any = module.samplers.CmaEsSampler(seed=job.seed, popsize=GENERATION, warn_independent_sampling=False)
         else:
             chosen = module.samplers.TPESampler(seed=job.seed, multivariate=True, constant_liar=True, n_startup_trials=RANDOM)
