@@ -111,13 +111,6 @@ def _stop(done, at):
         raise KeyboardInterrupt
 
 
-def test_without_its_package_a_sampler_says_what_to_install(monkeypatch, tmp_path):
-    monkeypatch.setattr(search.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ImportError, match=r"tailgate\[tune\].*--sampler tpe"):
-        falsify(Search(ROAD, "cmaes", 32), tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
 # Shrinking
 
 
