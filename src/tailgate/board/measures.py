@@ -23,6 +23,14 @@ from .damage import Reach, Table, damaged, has_road, stalled
 from .schema import Data
 from .worst import Worst
 
+ABOUT = {  # how to read each
+    "pointwise": "Share of episodes that none of the attacks damaged: a bound with hindsight, as an attacker would have to know beforehand "
+    "which attack works in which episode",
+    "severity": "Mean closing speed of the collisions under the worst attack, and the speed that nine of ten of them stay below",
+    "availability": "Distance under the worst attack over that without an attack, mean over episodes; least: under the attack that costs "
+    "most distance",
+    "mean_gap": "Mean gap without an attack over that of the undefended car, less one: a longer gap makes every attack harder",
+}  # fmt: skip
 SPEEDS = {"median": 0.5, "q90": 0.9, "most": 1.0}  # quantiles of impact speeds
 VAGUE = "the board does not say which episodes came to damage"
 NO_IMPACT = "no collision"
