@@ -23,7 +23,7 @@ from .schema import CellLine, Data
 
 PRINTS = ("hits", "decisions", "trace")  # which older boards lack
 COMPARED = ("n", "failed", "damage", *PRINTS)
-NO_CLEAN = "no whole clean run: lost progress cannot be told"
+NO_CLEAN = "no whole clean run to compare progress with"
 share = functools.cache(proportion)  # a board has few different counts
 
 

@@ -195,11 +195,9 @@ class Pointwise(Part):
 
 
 class Severity(Part):
-    """The damaged episodes of a cell: collisions, their closing speeds [m/s] where `measured`, and stops without a collision."""
-
     collisions: Count
-    measured: Count
-    stops: Count
+    measured: Count  # collisions with a closing speed: those in front [m/s]
+    stops: Count  # episodes that are damaged by lost progress alone
     mean: Number | None
     median: Number | None
     q90: Number | None
@@ -223,9 +221,7 @@ class UnderAttack(Part):
 
 
 class MeanGap(Part):
-    """The mean gap in clean runs over that of the undefended car, less one."""
-
-    value: Number
+    value: Number  # mean gap in clean runs over that of the undefended car, less one
     episodes: Count
 
 
