@@ -15,8 +15,12 @@ import numpy as np
 import pytest
 
 from tailgate.base.errors import InputError
+from tailgate.board import equal_gap
+from tailgate.board.attachments import Attachments, EqualGap
+from tailgate.board.cells import hits_of
 from tailgate.board.check import check
 from tailgate.board.consistency import strays
+from tailgate.board.equal_gap import measure_gap
 from tailgate.board.files import read_board
 from tailgate.board.head import lines
 from tailgate.board.measures import VAGUE
@@ -381,6 +385,38 @@ def test_a_page_has_the_columns_of_a_board_that_has_the_figures(small: tuple[Sui
     bare["suite"]["measures"] = True
     network = Outline(build_site([bare], tmp_path / "network", replays=False).read_text(encoding="utf-8")).rows("cells ranks")[0]
     assert "No attack damages" in network and "Impact" not in network and "Gap" not in network
+
+
+def test_at_its_own_headway_the_reference_is_the_entry_of_the_board(small: tuple[Suite, Path]) -> None:
+    """Else the comparison would be of two different things: the same episodes, attacks and damage, but for the headway."""
+    given, made = small[0], json.loads((small[1] / "board.json").read_text())
+    cells = [c for c in made["cells"] if c["defence"] == "kf" and c["attack"] != "none"]
+    for held in cells:
+        assert equal_gap._harm(made, given, held, 1.0).tolist() == hits_of(held).astype(bool).tolist(), held["attack"]
+    assert sum(int(hits_of(held).sum()) for held in cells) > 0
+
+
+def test_who_keeps_a_longer_gap_is_compared_at_equal_gap(small: tuple[Suite, Path], tmp_path: Path) -> None:
+    given, made = small[0], json.loads((small[1] / "board.json").read_text())
+    found = measure_gap(made, given, ["brake_kf", "coast", "stand_still"])
+    (line,) = found.entries
+    assert line.defence == "coast" and line.gap == entry(made, "coast")["mean_gap"]["value"] > 0.1
+    assert 1.0 < line.factor < 4.0 and line.kept == pytest.approx(line.gap, abs=0.005)
+    assert line.undamaged.low <= line.undamaged.value and line.undamaged.value >= rate(entry(made, "kf"), 12)["undamaged"]["value"]
+    reasons = {one.defence: one.why for one in found.without}
+    assert "no longer than that of kf" in reasons["brake_kf"] and "4 times its headway" in reasons["stand_still"]
+    assert measure_gap(made, given, ["coast"]).entries == found.entries, "the same figures again"
+    path = found.write(tmp_path)
+    assert EqualGap.read(path) == found and found.belongs(read_board(made)) == found
+    build_site([made], tmp_path / "page", replays=False, measured=[Attachments(gap=found)])
+    assert "At equal mean gap" in (tmp_path / "page" / "small-v1" / "coast.html").read_text(encoding="utf-8")
+    assert "At equal mean gap" not in (tmp_path / "page" / "small-v1" / "kf.html").read_text(encoding="utf-8")
+    entry(made, "coast")["mean_gap"]["value"] = 0.2
+    assert found.belongs(read_board(made)).entries == [], "of another gap it says nothing"
+    with pytest.raises(InputError, match="measures"):
+        measure_gap(made | {"suite": made["suite"] | {"hash": (bare := replace(given, measures=False)).hash}}, bare)
+    with pytest.raises(InputError, match="coat"):
+        measure_gap(made, given, ["coat"])
 
 
 def test_the_terminal_has_the_columns(small: tuple[Suite, Path]) -> None:

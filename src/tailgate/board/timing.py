@@ -117,7 +117,7 @@ def _timed(cell: Data, board: Data, suite: Suite, episodes: int | None) -> Timed
     beacon, purpose = board["suite"].get("beacon") or "", board["suite"].get("purpose") or "report"
 
     def harm(keys: draws.Keys, schedule: Array | None) -> Array:
-        return _harm(cell, suite, played(loop, who.policy, keys, schedule, [METRICS[name] for name in HARM]), lambda: _reach(loop, keys))
+        return harmed(cell, suite, played(loop, who.policy, keys, schedule, [METRICS[name] for name in HARM]), lambda: _reach(loop, keys))
 
     here = harm(draws.keys(purpose, sorted(numbered(beacon, suite.name, purpose, 0, n))), None)  # in the order of `hits`
     if not _same(cell, here):
@@ -140,7 +140,7 @@ def _timed(cell: Data, board: Data, suite: Suite, episodes: int | None) -> Timed
     )  # fmt: skip
 
 
-def _harm(cell: Data, suite: Suite, found: Sequence[Array], clean: Callable[[], dict[int, float]]) -> Array:
+def harmed(cell: Data, suite: Suite, found: Sequence[Array], clean: Callable[[], dict[int, float]]) -> Array:
     """Return (B,) bool: the damaged episodes, as rows say it. found: the metrics of HARM, (B,) each; clean: distances of clean runs."""
     values = dict(zip(HARM, found, strict=True))
     head = {key: cell[key] for key in ("scenario", "defence", "attack")}

@@ -176,6 +176,9 @@ def _print_properties(found: dict[str, Any]) -> None:
     for entry in found["defences"]:
         for p in entry["properties"]:
             share, when = p["share"], p["antecedent"]
+            if share is None:
+                rows.append((entry["defence"], p["name"], *["-"] * 5, p["reason"]))
+                continue
             often = _told(p) if when is None else f"in {when['runs']} of {when['of']} runs, {_percent(when['instants'])} of the steps"
             often += _alarms(p.get("false_alarms", []))
             span = f"{_percent(share['low'])} to {_percent(share['high'])}"

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from tailgate.board.attachments import EqualGap
 from tailgate.board.measures import ABOUT
 from tailgate.board.schema import LEVELS, Data, Entry, Level, MeanGap, Pointwise, UnderAttack
-from tailgate.board.words import percent
+from tailgate.board.words import at_least, percent
 
 from .suite import Suite, dose_text, figure
 
@@ -38,7 +39,7 @@ def cells_of(suite: Suite, entry: Entry, columns: list[Data]) -> list[dict[Level
     return [found[column["name"]] for column in columns]
 
 
-def table_of(suite: Suite, entry: Entry) -> Data | None:
+def table_of(suite: Suite, entry: Entry, equal: EqualGap | None = None) -> Data | None:
     """Return the section of an entry: a row per dose and knowledge; None on a board without measures."""
     if not suite.board.suite.measures:
         return None
@@ -54,7 +55,19 @@ def table_of(suite: Suite, entry: Entry) -> Data | None:
             "speeds": [figure(x, 3) for x in speeds], "reason": severity.reason if severity else "",
             "kept": _availability(suite, line),
         })  # fmt: skip
-    return {"rows": rows, "road": bool(lines), "gap": _gap(entry.mean_gap), "about": ABOUT}
+    return {"rows": rows, "road": bool(lines), "gap": _gap(entry.mean_gap), "about": ABOUT, "equal": _equal(suite, entry, equal)}
+
+
+def _equal(suite: Suite, entry: Entry, equal: EqualGap | None) -> str:
+    """Return the comparison at equal mean gap in a sentence; empty where nobody has made it."""
+    held = next((line for line in equal.entries if line.defence == entry.defence), None) if equal else None
+    if held is None:
+        return ""
+    share = f"{percent(held.undamaged.value)} (at least {at_least(held.undamaged.low)})"
+    return (
+        f"At equal mean gap, behind a controller with {figure(held.factor, 3)} times the headway, {held.reference} keeps {share} of the "
+        f"episodes undamaged at {dose_text(held.dose)}, black box; worst: {suite.where(held.scenario, held.attack)}."
+    )
 
 
 def _pointwise(point: Pointwise | None) -> Data:
