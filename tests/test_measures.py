@@ -415,6 +415,9 @@ def test_who_keeps_a_longer_gap_is_compared_at_equal_gap(small: tuple[Suite, Pat
     assert found.belongs(read_board(made)).entries == [], "of another gap it says nothing"
     with pytest.raises(InputError, match="measures"):
         measure_gap(made | {"suite": made["suite"] | {"hash": (bare := replace(given, measures=False)).hash}}, bare)
+    away = copy.deepcopy(made)
+    away["cells"] = [held for held in away["cells"] if held["attack"] == "none"]
+    assert "no black-box attack" in measure_gap(away, given, ["coast"]).without[0].why
     with pytest.raises(InputError, match="coat"):
         measure_gap(made, given, ["coat"])
 

@@ -74,20 +74,18 @@ def measure_gap(board: Data, suite: Suite, defences: Sequence[str] = (), *, prog
 
 
 def _compared(board: Data, suite: Suite, defence: str, gap: float) -> SameGap | Untimed:
-    """Return the reference at this mean gap against its attacks, or why it cannot keep it."""
+    """Return the reference at this mean gap against its attacks, or why there is no such figure."""
+    dose = doses_of(suite)[middle(suite)]
+    pairs = [c for c in board["cells"] if c["defence"] == REFERENCE and c["dose"] == dose and _counts(c, board)]
+    if not pairs:
+        return Untimed(defence=defence, why=f"no black-box attack that {REFERENCE} met can be played here")
     try:
         factor, kept = _headway(board, suite, gap)
     except NotApplicable as error:
         return Untimed(defence=defence, why=str(error))
-    dose = doses_of(suite)[middle(suite)]
-    worst, pairs = None, [c for c in board["cells"] if c["defence"] == REFERENCE and c["dose"] == dose and _counts(c, board)]
-    n = max(c["n"] for c in pairs)
-    for cell in pairs:
-        hits = int(_harm(board, suite, cell, factor).sum())
-        if worst is None or hits > worst[0]:
-            worst = hits, cell
-    assert worst is not None
-    hits, cell = worst
+    harm = [_harm(board, suite, cell, factor) for cell in pairs]
+    worst = int(np.argmax([x.sum() for x in harm]))
+    cell, hits, n = pairs[worst], int(harm[worst].sum()), len(harm[worst])
     low = 1.0 - float(limits(np.array([hits]), np.array([n]), board["suite"].get("alpha", 0.05) / len(pairs))[1][0])
     share = Limited(value=(n - hits) / n, low=low)
     return SameGap(

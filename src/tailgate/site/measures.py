@@ -64,9 +64,10 @@ def _equal(suite: Suite, entry: Entry, equal: EqualGap | None) -> str:
     if held is None:
         return ""
     share = f"{percent(held.undamaged.value)} (at least {at_least(held.undamaged.low)})"
+    worst = "no attack did damage" if held.undamaged.value == 1.0 else f"worst: {suite.where(held.scenario, held.attack)}"
     return (
         f"At equal mean gap, behind a controller with {figure(held.factor, 3)} times the headway, {held.reference} keeps {share} of the "
-        f"episodes undamaged at {dose_text(held.dose)}, black box; worst: {suite.where(held.scenario, held.attack)}."
+        f"episodes undamaged at {dose_text(held.dose)}, black box; {worst}."
     )
 
 
