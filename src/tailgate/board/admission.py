@@ -82,7 +82,8 @@ def admit(
     peers = [text for text in listed if text != CLEAN and not Spec("attack", text).entry.optimal]
     peers = [text for text in peers if order(knowledge_of(text, suite)) <= order(level)]
     part = dataclasses.replace(
-        suite, doses=(at,), shown={}, defences=tuple(defences), attacks=(*peers, attack), seeds=episodes or suite.seeds
+        suite, doses=(at,), shown={}, defences=tuple(defences), seeds=episodes or suite.seeds,
+        attacks=(*([] if suite.progress is None else [CLEAN]), *peers, attack),  # lost progress is measured against clean runs
     )  # fmt: skip
     work = cells_of(part, purpose="select", beacon=beacon)
     writable_directory(path.parent)  # before anything is played

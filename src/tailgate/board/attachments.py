@@ -4,6 +4,7 @@ A board is a pure function of rows, so clocks, machines, fresh episodes and past
 
     step_time.json  time of a step of each defence
     timing.json     worth of the timing of trained attackers
+    gap.json        the plain filter at the mean gap of entries that keep a longer one
     errata.json     superseded figures
     run.json        effort of playing the board
 """
@@ -172,6 +173,41 @@ class Timing(Attachment):
         return self.model_copy(update={"entries": kept})
 
 
+class SameGap(Part):
+    """An entry, and the reference behind a controller with a longer headway, which makes the mean gaps equal."""
+
+    defence: str
+    gap: Time  # mean gap without an attack over that of the undefended car, less one
+    reference: str
+    factor: Time  # times the scenario's headway
+    kept: float  # mean gap of the reference with it
+    dose: Dose
+    undamaged: Limited  # of the reference, under its worst attack
+    attacks: Positive
+    scenario: str
+    attack: str
+
+
+class EqualGap(Attachment):
+    """Comparisons at equal mean gap (`tailgate.board.equal_gap` measures them)."""
+
+    FILE, WHAT, MADE_BY = "gap.json", "comparisons at equal gap", "leaderboard gap"
+    format: Literal["tailgate-equal-gap-1"] = "tailgate-equal-gap-1"
+    hash: str
+    beacon: str
+    version: str
+    entries: list[SameGap]
+    without: list[Untimed]
+
+    def belongs(self, board: Board) -> Self:
+        """Return the comparisons of entries whose mean gap is still the same."""
+        for name, wanted in (("suite", board.suite.name), ("hash", board.suite.hash), ("beacon", board.suite.beacon or "")):
+            if (held := getattr(self, name)) != wanted:
+                raise InputError(f"{self.WHAT}: {name}", held, f"{wanted!r}, as in the board in the same folder")
+        gaps = {entry.defence: entry.mean_gap.value for entry in board.entries if entry.mean_gap is not None}
+        return self.model_copy(update={"entries": [entry for entry in self.entries if gaps.get(entry.defence) == entry.gap]})
+
+
 def _day(text: str) -> str:
     if date.fromisoformat(text).isoformat() != text:
         raise ValueError("expected a date, YYYY-MM-DD")
@@ -281,18 +317,19 @@ class Attachments(NamedTuple):
     timing: Timing | None = None
     errata: Errata | None = None
     run: Run | None = None
+    gap: EqualGap | None = None
 
     @classmethod
     def of(cls, board: Path) -> Attachments:
         """Return the attachments of a board's file."""
-        return cls(Clock.of(board), Timing.of(board), Errata.of(board), Run.of(board))
+        return cls(Clock.of(board), Timing.of(board), Errata.of(board), Run.of(board), EqualGap.of(board))
 
     def belonging(self, board: Board) -> Attachments:
         """Return what is of this board. Raises InputError for an attachment of another suite."""
         errata = self.errata and self.errata.belongs(board)
         return Attachments(
             self.clock and self.clock.belongs(board), self.timing and self.timing.belongs(board), errata,
-            self.run and self.run.belongs(board),
+            self.run and self.run.belongs(board), self.gap and self.gap.belongs(board),
         )  # fmt: skip
 
     def superseded(self, defence: str | None = None) -> list[Erratum]:

@@ -18,21 +18,27 @@ from tailgate.evaluation.rounds import numbered
 from tailgate.evaluation.rows import CLEAN, Row
 from tailgate.evaluation.stats import proportion
 
-from .damage import FAILED, MISSING, PLAYED, SKIPPED, Attacker, Key, Table, attackers_of, damaged, doses_of, in_order
+from .damage import FAILED, MISSING, PLAYED, SKIPPED, Attacker, Key, Reach, Table, attackers_of, comparable, damaged, doses_of, in_order
 from .schema import CellLine, Data
 
 PRINTS = ("hits", "decisions", "trace")  # which older boards lack
 COMPARED = ("n", "failed", "damage", *PRINTS)
+NO_CLEAN = "no whole clean run to compare progress with"
 share = functools.cache(proportion)  # a board has few different counts
 
 
-def figures(rows: Sequence[Row], suite: Suite) -> Data:
-    """Return a cell's figures: how many rows were played and failed, why, the damaged share and which episodes, and two fingerprints."""
+def figures(rows: Sequence[Row], suite: Suite, reach: Reach | None = None) -> Data:
+    """Return a cell's figures: how many rows were played and failed, why, the damaged share and which episodes, and two fingerprints.
+
+    reach: distances of the defence's clean runs, where the suite counts lost progress.
+    """
     rows = sorted(rows, key=lambda row: int(row["seed"]))  # a round's seeds are not played in ascending order
-    good = [damaged(row, suite) for row in rows if row["status"] == "ok"]
+    known = comparable(rows, suite, reach)
+    good = [damaged(row, suite, reach) for row in rows if row["status"] == "ok"] if known else []
+    reason = next((row["reason"] for row in rows if row["status"] != "ok"), "")
     return {
-        "n": len(good), "failed": sum(row["status"] == "error" for row in rows),
-        "reason": next((row["reason"] for row in rows if row["status"] != "ok"), ""),
+        "n": len(good), "failed": sum(row["status"] == "error" for row in rows) if known else len(rows),
+        "reason": reason if known else NO_CLEAN,
         "damage": share(sum(good), len(good))._asdict() if good else None, "hits": digits(good) if len(good) == len(rows) else None,
         "decisions": _fingerprint(rows, "decision_hash"), "trace": _fingerprint(rows, "trace_hash"),
     }  # fmt: skip
@@ -93,7 +99,7 @@ def cells_of(table: Table) -> list[Data]:
         {
             "scenario": key.scenario, "dose": table.doses[key.dose], "defence": key.defence, "attack": key.attacker.attack,
             "knowledge": key.attacker.knowledge, "learned": bool(rows[0].get("learned")), "optimal": bool(rows[0].get("optimal")),
-        } | figures(rows, table.suite)
+        } | figures(rows, table.suite, table.reach.get((key.scenario, key.defence)))
         for key, rows in table.cells.items()
     ], table)  # fmt: skip
 
@@ -147,7 +153,7 @@ def table_of(board: Data, suite: Suite) -> Table:
         whole = cell["n"] == episodes[key.scenario]
         if key.attacker.attack == CLEAN:
             if whole:
-                rows = [{"distance_travelled": 0.0, "crashed": bool(hit)} for hit in hits_of(cell)]
+                rows = [{"attack": CLEAN, "distance_travelled": 0.0, "crashed": bool(hit)} for hit in hits_of(cell)]
                 clean.setdefault((key.scenario, key.defence), rows)
             continue
         at = defences.index(key.defence), attackers.index(key.attacker), key.dose

@@ -7,6 +7,7 @@ all cells of the board were played.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,16 +22,18 @@ from tailgate.evaluation.attack_list import Admitted
 from tailgate.evaluation.cells import Cell, run
 from tailgate.evaluation.checks import Finding, Unplayable, again, counts, drawn, refused, sampling
 from tailgate.evaluation.paired import CLOSE, PAIR
-from tailgate.evaluation.rows import Row
+from tailgate.evaluation.rows import CLEAN, Row
 
 from .cells import PRINTS, compared, figures, shared_of
 from .consistency import same, sharpened, strays, untold
+from .damage import reach_of
 from .files import amended, known, read_board, suite_of
 from .schema import Board, CellLine, Data
 from .score import score
 
 VERDICTS = ("equal", "differs", "unchecked")
-SCORED = ("class", "uses", "status", "why", "gates", "critical_dose", "rates", "rank", "clean", "flags", "robustness")  # of an entry
+SCORED = ("class", "uses", "status", "why", "gates", "critical_dose", "rates", "rank", "clean", "flags", "robustness",
+          "pointwise", "under_attack", "mean_gap")  # fmt: skip
 EPISODES = 20_000  # whose rows are held at a time
 
 
@@ -73,6 +76,7 @@ def check(
     mine = [i for i, cell in enumerate(board.cells) if not defences or cell.defence in defences]
     asked = drawn(mine, sample, sample_seed, "check")
     held: list[Row] = []  # of all cells of the board, if all are played
+    reach: dict[tuple[str, str], dict[int, float]] = {}  # of clean runs, where lost progress counts
 
     def play(cells: Mapping[int, Cell]) -> Iterator[tuple[int, Data]]:
         before = len(asked) - len(cells)
@@ -83,11 +87,13 @@ def check(
 
         for some in _slices(cells):
             rows = run([cells[i] for i in some], workers=workers, progress=tell)
+            if suite.progress is not None:
+                _add_reach(reach, [cells[i] for i in some], workers)
             before += len(some)
             if len(cells) == len(board.cells):
                 held.extend(rows)
             each = iter(rows)
-            yield from ((i, figures(list(itertools.islice(each, cells[i].seeds)), suite)) for i in some)
+            yield from ((i, figures(list(itertools.islice(each, cells[i].seeds)), suite, reach.get(_where(cells[i])))) for i in some)
 
     files = {attack.attack: attack.digest for attack in board.attacks}
     seen = again(asked, lambda i: _cell(board.cells[i], board, suite), play, lambda i, here: _compared(board.cells[i], here, files))
@@ -157,6 +163,20 @@ def _cell(part: CellLine, board: Board, suite: Suite) -> Cell:
     if knowledge != part.knowledge:
         raise Unplayable(f"the attack {part.attack!r} is granted the knowledge {knowledge} here")
     return cell
+
+
+def _where(cell: Cell) -> tuple[str, str]:
+    return cell.scenario, cell.defence
+
+
+def _add_reach(reach: dict[tuple[str, str], dict[int, float]], cells: Sequence[Cell], workers: int) -> None:
+    """Add the distances of the clean runs that these cells are judged by; a run that fails has none, as on a board."""
+    clean = {_where(cell): dataclasses.replace(cell, attack=CLEAN) for cell in cells if _where(cell) not in reach}
+    rows = iter(run(list(clean.values()), workers=workers))
+    for where, cell in clean.items():
+        runs = list(itertools.islice(rows, cell.seeds))
+        if all(row["status"] == "ok" for row in runs):
+            reach[where] = reach_of(runs)
 
 
 def _slices(cells: Mapping[int, Cell]) -> Iterator[list[int]]:

@@ -27,8 +27,10 @@ def strays(board: Data, suite: Suite) -> list[Data]:
     """
     table, out = table_of(board, suite), []
     held, doses = board["suite"], shown(suite)
-    told = {"doses": list(table.doses), "shown": [str(table.doses[dose]) for dose in doses] if suite.shown else [], "bound": suite.bound}
-    said = {"doses": held["doses"], "shown": list(held.get("shown", {})), "bound": held.get("bound")}
+    told = {"doses": list(table.doses), "shown": [str(table.doses[dose]) for dose in doses] if suite.shown else [], "bound": suite.bound,
+            "progress": suite.progress, "measures": suite.measures}  # fmt: skip
+    said = {"doses": held["doses"], "shown": list(held.get("shown", {})), "bound": held.get("bound"), "progress": held.get("progress"),
+            "measures": held.get("measures", False)}  # fmt: skip
     out += [_stray("", f"suite.{key}", said[key], told[key]) for key in told if not same(said[key], told[key])]
     for i, cell in enumerate(board["cells"]):
         here = share(int(hits_of(cell).sum()), cell["n"])._asdict() if cell["n"] else None

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ from tailgate.evaluation.rows import CLEAN, Row
 from tailgate.play.metrics import METRICS
 
 PLAYED, MISSING, SKIPPED, FAILED = range(4)  # what became of a cell
+Reach = Mapping[int, float]  # distance of a defence's clean runs in a scenario, by seed [m]
 
 
 class Attacker(NamedTuple):
@@ -44,13 +46,40 @@ def has_road(row: Row) -> bool:
     return row["distance_travelled"] is not None
 
 
-def damaged(row: Row, suite: Suite) -> bool:
-    """Return if a row that was played ended in a collision, in front or behind; without a road, in an error above the suite's bound."""
+def damaged(row: Row, suite: Suite, reach: Reach | None = None) -> bool:
+    """Return if a row that was played ended in a collision, in front or behind; without a road, in an error above the suite's bound.
+
+    Where the suite counts lost progress, an attacked car is damaged too that covers too little of its clean distance (`reach`).
+    """
     if has_road(row):
-        return bool(row["crashed"])
+        return bool(row["crashed"]) or stalled(row, suite, reach)
     if suite.bound is None:
         raise InputError(f"suite {suite.name}: bound", None, f"an error that counts as damage: nobody drives in {row['scenario']}")
     return bool(row["crashed"]) or row["max_error"] > suite.bound
+
+
+def stalled(row: Row, suite: Suite, reach: Reach | None) -> bool:
+    """Return if an attacked row covers less than the suite's share of the distance of its clean run on the same seed.
+
+    Raises InputError where that run is not known.
+    """
+    share = suite.progress
+    if share is None or not judged_by_clean(row, suite):
+        return False
+    if reach is None or row["seed"] not in reach:
+        what = f"rows of {row['scenario']}, {row['defence']}, seed {row['seed']}: clean run"
+        raise InputError(what, None, f"a row of the attack {CLEAN}: {suite.name} counts lost progress")
+    return bool(row["distance_travelled"] < share * reach[row["seed"]])
+
+
+def judged_by_clean(row: Row, suite: Suite) -> bool:
+    """Return if the damage of a row that was played depends on the clean run."""
+    return suite.progress is not None and row["attack"] != CLEAN and has_road(row)
+
+
+def reach_of(rows: Iterable[Row]) -> dict[int, float]:
+    """Return the distances of clean runs on a road, by seed [m]."""
+    return {row["seed"]: row["distance_travelled"] for row in rows if row["status"] == "ok" and has_road(row)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +109,7 @@ class Table:
     rows: int
     vague: frozenset[Key] = frozenset()  # cells of a board that do not say which episodes came to damage: the first ones stand for them
     shared: frozenset[str] = frozenset()  # what is on no list and all entries of a board have met: who joins has to have met it too
+    reach: Mapping[tuple[str, str], Reach] = dataclasses.field(default_factory=dict)  # of clean runs, by scenario and defence
 
     @property
     def asked(self) -> frozenset[str]:
@@ -155,6 +185,7 @@ def tabulate(rows: Iterable[Row], suite: Suite, added: Sequence[str] = (), withd
     for key in sorted(cells, key=lambda key: (key.dose, order(key.attacker.knowledge))):
         if key.attacker.attack == CLEAN and all(row["status"] == "ok" for row in cells[key]):
             clean.setdefault((key.scenario, key.defence), cells[key])  # the same at every dose
+    reach = {at: reach_of(runs) for at, runs in clean.items()}
     shape = (len(defences), len(attackers), len(doses))
     harm = {name: np.full((*shape, len(seeds.get(name, ()))), np.nan) for name in scenarios}
     state = {name: np.full(shape, MISSING) for name in scenarios}
@@ -163,9 +194,11 @@ def tabulate(rows: Iterable[Row], suite: Suite, added: Sequence[str] = (), withd
             continue
         at = defences.index(key.defence), attackers.index(key.attacker), key.dose
         statuses = {row["status"] for row in members}
+        if not comparable(members, suite, reach.get((key.scenario, key.defence))):
+            statuses = {"error"}
         state[key.scenario][at] = FAILED if "error" in statuses else SKIPPED if "skipped" in statuses else PLAYED
         if statuses == {"ok"}:
-            harm[key.scenario][at] = [damaged(row, suite) for row in members]
+            harm[key.scenario][at] = [damaged(row, suite, reach.get((key.scenario, key.defence))) for row in members]
     marks = {
         mark: {one: any(bool(m[0].get(mark)) for key, m in cells.items() if key.attacker.attack == one.attack) for one in attackers}
         for mark in ("optimal", "learned")
@@ -173,7 +206,13 @@ def tabulate(rows: Iterable[Row], suite: Suite, added: Sequence[str] = (), withd
     return Table(
         suite, scenarios, doses, defences, attackers, seeds, cells, clean, harm, state, marks["optimal"], marks["learned"],
         listed, frozenset(withdrawn), rows[0]["purpose"], str(rows[0].get("beacon", "")), sum(len(members) for members in cells.values()),
+        reach=reach,
     )  # fmt: skip
+
+
+def comparable(rows: Sequence[Row], suite: Suite, reach: Reach | None) -> bool:
+    """Return if a cell can be judged: where the suite counts lost progress, a defence without whole clean runs cannot be."""
+    return reach is not None or not any(row["status"] == "ok" and judged_by_clean(row, suite) for row in rows)
 
 
 def hashes_of(scenario: Scenario, suite: Suite, dose: int | None, knowledge: str) -> tuple[str, ...]:

@@ -18,6 +18,8 @@ from tailgate.training.adaptive import Asked
 from .damage import PLAYED, Key, Table, doses_of, has_road, named
 from .flags import flags, of_attacks, standing
 from .gates import failure, gates
+from .measures import extended as later
+from .measures import mean_gap, pointwise, under_attack
 from .schema import Data
 from .worst import Worst
 
@@ -60,7 +62,13 @@ def entry_of(table: Table, defence: str, levels: dict[str, Worst], dose: int, or
         "defence": defence, "card": None if card is None else card.card(), "uses": uses, "class": class_of(uses),
         "status": status, "why": why, "gates": found, "rank": None, "clean": _clean(table, defence),
         "flags": flags(table, defence, levels, dose, origins), "worst_episode": _episode(table, whole, dose), "stealth": None,
-    } | of_worst(table, levels, dose)  # fmt: skip
+    } | of_worst(table, levels, dose) | (_measures(table, defence, whole) if table.suite.measures else {})  # fmt: skip
+
+
+def _measures(table: Table, defence: str, whole: dict[str, Worst]) -> Data:
+    """Return the measures of an entry that need rows: by dose and knowledge, and its mean gap without an attack."""
+    lines = (under_attack(worst, at) for at in shown(table.suite) for worst in whole.values())
+    return {"under_attack": [line for line in lines if line is not None], "mean_gap": mean_gap(table, defence)}
 
 
 def extended(entry: Data, table: Table, levels: dict[str, Worst], dose: int, trained: dict[str, str], added: Collection[str]) -> Data:
@@ -79,6 +87,9 @@ def extended(entry: Data, table: Table, levels: dict[str, Worst], dose: int, tra
         out["worst_episode"] = min((row for row in (old, new) if row is not None), key=_margin, default=None)
     elif hit[0].named(hit[0].at(hit[1])[0])["attack"] in added:
         out["worst_episode"] = _episode(table, whole, dose)
+    if table.suite.measures:
+        lines = (later(entry["under_attack"], worst, at, added) for at in shown(table.suite) for worst in whole.values())
+        out["under_attack"] = [line for line in lines if line is not None]
     own = any(trained.get(attack) == entry["defence"] for attack in added)
     said = of_attacks(table, entry["defence"], levels, dose, trained)
     return out | {"flags": [*dict.fromkeys([*standing(entry["flags"], levels, dose, added, own), *said])]}
@@ -95,7 +106,7 @@ def of_worst(table: Table, levels: dict[str, Worst], dose: int) -> Data:
         "critical_dose": {k: critical[tuple(worst.pairs)] if k in whole else None for k, worst in levels.items()},
         "rates": [worst.rate(s) for s in shown(table.suite) for worst in whole.values()],
         "robustness": _robustness(table, whole.get("black"), dose),
-    }
+    } | ({"pointwise": [pointwise(worst, s) for s in shown(table.suite) for worst in whole.values()]} if table.suite.measures else {})
 
 
 def curves(levels: dict[str, Worst]) -> list[Data]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 from .files import read_board
@@ -28,9 +29,13 @@ def lines(board: Board) -> list[tuple[str, ...]]:
     suite = board["suite"]
     doses = list(suite["shown"]) or [str(dose) for dose in suite["doses"]]
     trusted = any(entry.get("trust") for entry in board["entries"])
-    out: list[tuple[str, ...]] = [
-        ("defence", "class", "rank", "critical dose", *(f"undamaged at {dose}" for dose in doses), *["trust (safety)"] * trusted, "why not")
-    ]  # fmt: skip
+    measured, middle = bool(suite.get("measures")), doses[len(doses) // 2]
+    road = measured and any(entry.get("under_attack") for entry in board["entries"])
+    more = [f"no attack damages at {middle}"] * measured + [f"impact at {middle} [m/s]", f"distance kept at {middle}", "gap"] * road
+    out: list[tuple[str, ...]] = [(
+        "defence", "class", "rank", "critical dose", *(f"undamaged at {dose}" for dose in doses), *more,
+        *["trust (safety)"] * trusted, "why not",
+    )]  # fmt: skip
     by_name = {entry["defence"]: entry for entry in board["entries"]}
     for entry in [by_name[part.defence] for part in ordered(parts)]:
         rank, critical = entry["rank"], entry["critical_dose"]["black"]
@@ -40,7 +45,8 @@ def lines(board: Board) -> list[tuple[str, ...]]:
         place = "-" if rank is None else "alone" if ranked == 1 else " to ".join(map(str, dict.fromkeys([rank["best"], rank["worst"]])))
         dose = "-" if critical is None else _dose(critical, suite["doses"])
         bound = [_trust(entry.get("trust"))] * trusted
-        out.append((entry["defence"], entry["class"], place, dose, *shown, *bound, entry["why"]))
+        extra = [_pointwise(entry, middle)] * measured + [*_under_attack(entry, middle), _gap(entry.get("mean_gap"))] * road
+        out.append((entry["defence"], entry["class"], place, dose, *shown, *extra, *bound, entry["why"]))
     return out
 
 
@@ -56,6 +62,30 @@ def markdown(board: Board, most: int | None = None) -> str:
 
 def _share(undamaged: Board) -> str:
     return f"{100 * undamaged['value']:.0f} % (at least {at_least(undamaged['low']).rstrip('%')})"
+
+
+def _line(lines: Iterable[Board], dose: str) -> Board | None:
+    return next((line for line in lines if str(line["dose"]) == dose and line["knowledge"] == "black"), None)
+
+
+def _pointwise(entry: Board, dose: str) -> str:
+    line = _line(entry.get("pointwise", ()), dose)
+    held = line["undamaged"] if line else None
+    return "-" if held is None else f"{100 * held['value']:.0f} % ({100 * held['low']:.0f} to {100 * held['high']:.0f})"
+
+
+def _under_attack(entry: Board, dose: str) -> list[str]:
+    """Return the mean impact speed with its 90th percentile, and the kept distance with the least of all attacks."""
+    line = _line(entry.get("under_attack", ()), dose)
+    if line is None:
+        return ["-", "-"]
+    hard, kept, least = line["severity"], line["availability"], line["least"]
+    impact = "-" if hard["mean"] is None else f"{hard['mean']:.3g} (90 %: {hard['q90']:.3g})"
+    return [impact, "-" if kept is None else f"{100 * kept:.0f} %" + (f" (least {100 * least['value']:.0f})" if least else "")]
+
+
+def _gap(gap: Board | None) -> str:
+    return "-" if gap is None else f"{100 * gap['value']:+.1f} %"
 
 
 def _trust(held: Board | None) -> str:

@@ -46,6 +46,8 @@ def play(
     if attacks is None and defences is not None:
         defences = list(dict.fromkeys([CLEAN, *defences]))  # the undefended car is what gates measure against
     _one_round(folder, beacon)
+    if attacks is not None and suite.progress is not None:
+        attacks = list(dict.fromkeys([CLEAN, *attacks]))  # lost progress is measured against clean runs
     some = repr(defences if attacks is None else (defences, list(attacks)))
     name = hashlib.blake2b(some.encode(), digest_size=4).hexdigest()
     file = folder / (OWN if defences is None and attacks is None else f"rows-{name}.jsonl.xz")

@@ -48,6 +48,8 @@ class SuiteLine(Part):
     beacon: Text | None = None  # empty: public seeds; None: not stated
     rows: Count | None = None
     require_adaptive: bool = True  # only what met attackers that were trained against it is ranked
+    progress: Share | None = None  # of its clean distance, below which an attacked car counts as damaged
+    measures: bool = False  # entries have pointwise, under_attack and mean_gap
 
 
 class AttackLine(Part):
@@ -181,6 +183,48 @@ class Checked(Part):
     unchecked: Count
 
 
+class Pointwise(Part):
+    """The share of episodes that no attack damaged, in the scenario where it is least; None: `reason` says why."""
+
+    dose: Dose
+    knowledge: Level
+    undamaged: Interval | None
+    scenario: Text = ""
+    attacks: Count
+    reason: Text = ""
+
+
+class Severity(Part):
+    collisions: Count
+    measured: Count  # collisions with a closing speed: those in front [m/s]
+    stops: Count  # episodes that are damaged by lost progress alone
+    mean: Number | None
+    median: Number | None
+    q90: Number | None
+    most: Number | None
+    reason: Text = ""
+
+
+class Least(Worst):
+    value: Share
+
+
+class UnderAttack(Part):
+    """Severity and availability under the worst attack, and the attack that leaves the least availability."""
+
+    dose: Dose
+    knowledge: Level
+    worst: Worst
+    severity: Severity
+    availability: Share | None
+    least: Least | None
+
+
+class MeanGap(Part):
+    value: Number  # mean gap in clean runs over that of the undefended car, less one
+    episodes: Count
+
+
 class Entry(Part):
     defence: Text
     card: dict[str, Any] | None = None
@@ -196,6 +240,9 @@ class Entry(Part):
     flags: list[Text] = []
     worst_episode: dict[str, Any] | None = None
     robustness: list[Robust] = []
+    pointwise: list[Pointwise] = []
+    under_attack: list[UnderAttack] = []
+    mean_gap: MeanGap | None = None
     stealth: list[Stealth] | None = None
     trust: EntryTrust | None = None
     verified: Verified | None = None

@@ -91,7 +91,7 @@ def _suite(table: Table, alpha: float) -> Data:
             for name, scenario in table.scenarios.items()
         ],
         "episodes": max(len(seeds) for seeds in table.seeds.values()), "purpose": table.purpose, "beacon": table.beacon, "rows": table.rows,
-    }  # fmt: skip
+    } | {name: value for name, value in (("progress", suite.progress), ("measures", suite.measures)) if value}  # fmt: skip
 
 
 def _attacks(

@@ -18,13 +18,15 @@ from tailgate.base import sizes
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.version import VERSION
 from tailgate.core import Array, draws
+from tailgate.core.loop import Loop
+from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite
 from tailgate.evaluation.checks import refused
 from tailgate.evaluation.paired import mcnemar
 from tailgate.evaluation.rounds import numbered
+from tailgate.evaluation.rows import CLEAN
 from tailgate.evaluation.stats import holm, paired_difference, proportion
-from tailgate.play.metrics import measure
-from tailgate.play.trace import Trace
+from tailgate.play.metrics import METRICS
 from tailgate.studies.policies import loop_for, trained
 from tailgate.studies.timing import TWINS, played, schedules
 
@@ -34,6 +36,7 @@ from .damage import damaged
 from .files import agree, known, read_board
 from .schema import LEVELS, Data
 
+HARM = ("crashed", "distance_travelled", "max_error")  # metrics that damage is decided by
 Progress = Callable[[int, int], None]
 
 
@@ -114,7 +117,7 @@ def _timed(cell: Data, board: Data, suite: Suite, episodes: int | None) -> Timed
     beacon, purpose = board["suite"].get("beacon") or "", board["suite"].get("purpose") or "report"
 
     def harm(keys: draws.Keys, schedule: Array | None) -> Array:
-        return played(loop, who.policy, keys, schedule, [lambda trace: _harm(trace, suite)])[0].astype(bool)
+        return harmed(cell, suite, played(loop, who.policy, keys, schedule, [METRICS[name] for name in HARM]), lambda: _reach(loop, keys))
 
     here = harm(draws.keys(purpose, sorted(numbered(beacon, suite.name, purpose, 0, n))), None)  # in the order of `hits`
     if not _same(cell, here):
@@ -137,11 +140,22 @@ def _timed(cell: Data, board: Data, suite: Suite, episodes: int | None) -> Timed
     )  # fmt: skip
 
 
-def _harm(trace: Trace, suite: Suite) -> Array:
-    """Return (B,) the damaged episodes, as rows say it."""
-    values = {name: held for name, held in measure(trace).items() if name in ("crashed", "distance_travelled", "max_error")}
-    rows = [{name: None if np.isnan(held[i]) else float(held[i]) for name, held in values.items()} for i in range(trace.batch)]
-    return np.array([damaged(row, suite) for row in rows], np.float64)
+def harmed(cell: Data, suite: Suite, found: Sequence[Array], clean: Callable[[], dict[int, float]]) -> Array:
+    """Return (B,) bool: the damaged episodes, as rows say it. found: the metrics of HARM, (B,) each; clean: distances of clean runs."""
+    values = dict(zip(HARM, found, strict=True))
+    head = {key: cell[key] for key in ("scenario", "defence", "attack")}
+    rows = [
+        head | {"seed": i} | {name: None if np.isnan(held[i]) else float(held[i]) for name, held in values.items()}
+        for i in range(len(found[0]))
+    ]
+    reach = None if suite.progress is None else clean()
+    return np.array([damaged(row, suite, reach) for row in rows], bool)
+
+
+def _reach(loop: Loop, keys: draws.Keys) -> dict[int, float]:
+    """Return the distance [m] of the clean run of each key, by its number."""
+    distance = played(loop, Spec("attack", CLEAN).make(), keys, None, [METRICS["distance_travelled"]])[0]
+    return dict(enumerate(distance.tolist()))
 
 
 def _same(cell: Data, harm: Array) -> bool:

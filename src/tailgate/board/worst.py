@@ -78,6 +78,10 @@ class Worst:
         _, harm = self.harm(pair, dose)
         return float((len(harm) - harm.sum()) / len(harm))
 
+    def spared(self, scenario: str, dose: int) -> Array:
+        """Return (episodes,) bool: those of a scenario that no attack damaged."""
+        return np.asarray(np.all([self._harm(name, i)[dose] == 0.0 for name, i in self.pairs if name == scenario], axis=0))
+
     def named(self, pair: int) -> Data:
         name, i = self.pairs[pair]
         return {"scenario": name, "attack": self.table.attackers[i].attack}

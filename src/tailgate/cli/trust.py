@@ -179,13 +179,21 @@ def _print_properties(found: dict[str, Any]) -> None:
             if share is None:
                 rows.append((entry["defence"], p["name"], *["-"] * 5, p["reason"]))
                 continue
-            often = "-" if when is None else f"in {when['runs']} of {when['of']} runs, {_percent(when['instants'])} of the steps"
+            often = _told(p) if when is None else f"in {when['runs']} of {when['of']} runs, {_percent(when['instants'])} of the steps"
             often += _alarms(p.get("false_alarms", []))
             span = f"{_percent(share['low'])} to {_percent(share['high'])}"
             figures = _percent(share["value"]), f"{share['k']} of {share['n']}", span, _place(share), often
             rows.append((entry["defence"], p["name"], *figures))
     columns = ("defence", "property", "share", "runs", "interval", "worst", "antecedent", *(("why not",) if why else ()))
     table(columns, rows, "each property in its worst cell", "intervals hold for all cells of a property together")
+
+
+def _told(known: dict[str, Any]) -> str:
+    """Say in how many runs the alarm is on with the attack alone, and without it alone; a dash for other properties."""
+    if "earned" not in known:
+        return "-"
+    share = known["share"]
+    return f"alarm in {share['attacked']} attacked runs alone, in {share['clean']} twins alone; earned {_percent(known['earned'])}"
 
 
 def _alarms(prices: list[dict[str, Any]]) -> str:

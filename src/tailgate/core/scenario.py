@@ -13,7 +13,7 @@ from tailgate.base.sizes import Episodes
 from tailgate.core import Defence, Positive, param
 from tailgate.core.loop import Loop
 from tailgate.core.lossy_link import Link
-from tailgate.core.quantities import Horizon
+from tailgate.core.quantities import Fraction, Horizon
 from tailgate.core.registry import Spec, make_from
 from tailgate.core.schema import build, digest, fields_of, read_yaml
 from tailgate.core.threat import Brief, ThreatModel
@@ -113,7 +113,8 @@ class Suite:
     robustness: tuple[str, ...] = param((), "those scenarios whose plant is not the one that a defence is told")
     adaptive: dict[str, Any] = dataclasses.field(default_factory=dict, metadata={"doc": "how attackers are trained against a defence"})
     held_out: tuple[str, ...] = param((), "attacks, by name, that are kept out of logs for those who learn a detector")
-
+    progress: Fraction | None = param(None, "share of its clean distance below which an attacked car counts as damaged; none: never")
+    measures: bool = param(False, "a board has more than the worst rate: pointwise worst, severity, availability, mean gap")
 
     @property
     def hash(self) -> str:
@@ -206,8 +207,10 @@ def load_suite(name: str) -> Suite:
 
 def _look_through(suite: Suite) -> None:
     """Raise InputError for a component that does not exist, and for attackers that cannot be trained."""
-    for scenario in suite.scenarios:
-        load_scenario(scenario)
+    for name in suite.scenarios:
+        scenario = load_scenario(name)
+        if suite.progress is not None and not scenario.brief().model.followers.any():
+            raise InputError(f"suite {suite.name}: progress", suite.progress, f"none: nobody follows another in {name}")
     for spec in (*(Spec("defence", text) for text in suite.defences), *(Spec("attack", text) for text in suite.attacks)):
         if not spec.sandboxed:
             spec.make()
@@ -229,6 +232,8 @@ def _read_suite(path: Path) -> Suite:
         Spec("defence", text).refuse_imports(f"suite {path.stem}")
     for text in (*suite.attacks, *suite.held_out):
         Spec("attack", text).refuse_imports(f"suite {path.stem}")
+    if suite.progress is not None and "none" not in suite.attacks:
+        raise InputError(f"suite {path.stem}: attacks", list(suite.attacks), "none among them, as progress compares with clean runs")
     for name in suite.robustness:
         if name not in suite.scenarios:
             raise unknown(f"suite {path.stem}: robustness", name, suite.scenarios)

@@ -17,7 +17,7 @@ from tailgate.play.metrics import ERRORS, METRICS, UNITS
 from tailgate.replay.page import VERDICTS, outcome, write_page
 from tailgate.replay.replay import play
 
-from . import alarms
+from . import alarms, measures
 from .cards import card_of
 from .curves import curves_of, reached_of, stealth_of
 from .index import compared_how, comparisons_of
@@ -191,7 +191,8 @@ def entry_page(
         "flags": [*entry.flags, *flags_of(measured.timing, entry.defence), *alarms.drifts_of(suite, entry.defence)],
         "alarms": alarms.table_of(suite, entry.defence), "errata": measured.superseded(entry.defence),
         "critical": [(level, critical_of(suite, entry, level)) for level in LEVELS],
-        "rates": _rates(suite, entry), "worst": _worst(suite, entry), "cells": _every(suite, entry),
+        "rates": _rates(suite, entry), "measures": measures.table_of(suite, entry, measured.gap),
+        "worst": _worst(suite, entry), "cells": _every(suite, entry),
         "charts": curves[0]["charts"] if curves else [], "clean": _clean(suite, entry),
         "stealth": [reached_of(s) for s in entry.stealth or ()], "stealth_chart": stealth["chart"] if stealth else None,
         "detection": [(line, interval_of(line.detected)) for line in suite.board.detected(entry.defence)],

@@ -10,7 +10,7 @@ from tailgate.board.schema import LEVELS, CellLine, Data, Dose, Level
 from tailgate.board.words import Name, at_least, percent
 from tailgate.training import adaptive
 
-from . import alarms
+from . import alarms, measures
 from .cards import attack_cards, suite_of
 from .curves import curves_of, stealth_of, together_of
 from .suite import Suite, cell_of, critical_of, dose_text, figure, gates_of, played, share_of, worse
@@ -23,7 +23,7 @@ TRAINED = Name("trained against it", ("the worst",))
 
 def _lines(suite: Suite, measured: Attachments) -> list[Data]:
     ranked = [e for e in suite.board.entries if e.rank]
-    out = []
+    out, columns = [], measures.columns_of(suite)
     for i, entry in enumerate(ordered(suite.board.entries)):
         rates = {(r.dose, r.knowledge): share_of(r.undamaged) for r in entry.rates}
         rank = {"text": "\N{EN DASH}", "sort": "", "of": 0}
@@ -37,7 +37,7 @@ def _lines(suite: Suite, measured: Attachments) -> list[Data]:
             "class": entry.class_ or "not stated", "rank": rank,
             "critical": [critical_of(suite, entry, level) for level in ("black", "white")],
             "rates": [{level: rates.get((dose, level), share_of(None)) for level in LEVELS} for dose in suite.shown],
-            "trust": trust_cell(suite, entry), "gates": gates_of(entry),
+            "measures": measures.cells_of(suite, entry, columns), "trust": trust_cell(suite, entry), "gates": gates_of(entry),
             "flags": [*entry.flags, *flags_of(measured.timing, entry.defence), *alarms.drifts_of(suite, entry.defence)],
             "status": entry.status, "why": entry.why,
         })  # fmt: skip
@@ -275,7 +275,7 @@ def section(suite: Suite, measured: Attachments) -> Data:
     return {
         "suite": board.suite, "round": suite.round, "checked": checked_of(suite),
         "trust": trust_of(suite), "damage": suite.damage, "folder": suite.folder,
-        "count": len(rows), "doses": doses,
+        "count": len(rows), "doses": doses, "measures": measures.columns_of(suite),
         "all_doses": ", ".join(dose_text(d) for d in board.suite.doses), "limit": percent(board.suite.limit),
         "groups": [g for g in groups if g["rows"]], "classes": sorted({r["class"] for r in rows}),
         "statuses": [s for s, *_ in GROUPS if any(r["status"] == s for r in rows)], "levels": LEVELS,

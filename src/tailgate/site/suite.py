@@ -79,7 +79,11 @@ class Suite:
     @property
     def damage(self) -> str:
         bound = self.board.suite.bound
-        return "a collision, in front or behind" if bound is None else f"an error above {figure(bound)}"
+        if bound is not None:
+            return f"an error above {figure(bound)}"
+        share = self.board.suite.progress
+        less = "" if share is None else f", or less than {percent(share)} of the distance without an attack"
+        return f"a collision, in front or behind{less}"
 
     @property
     def places(self) -> list[float]:

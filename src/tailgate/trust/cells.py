@@ -24,6 +24,7 @@ from tailgate.evaluation.rows import CLEAN
 from tailgate.play.trace import Trace, episodes_at_once, rollout
 
 from .false_alarms import DETECTS, false_alarms
+from .informs import INFORMS, Informed, informed, twin_alarms
 from .logic import Eventually, Interval, along, holds, robustness
 from .properties import CONJUNCTIONS, Demands, Property, built_in, conjunctions, own
 from .signals import SafeDistance, sample
@@ -111,11 +112,14 @@ class Found:
     together: dict[str, tuple[str, ...]]  # names of the conjunctions and of what they are made of
     runs: dict[str, list[Array]]
     alarms: int | None = None  # false ones, of clean runs in which detection is asked for
+    informed: dict[str, int] | None = None  # pairs of an attacked run and its twin, where detection is asked for
 
-    def add(self, outcomes: dict[str, Outcome], alarms: Array | None) -> None:
+    def add(self, outcomes: dict[str, Outcome], alarms: Array | None, pairs: Informed | None) -> None:
         """Add the next runs."""
         if alarms is not None:
             self.alarms = (self.alarms or 0) + int(alarms.sum())
+        if pairs is not None:
+            self.informed = {name: (self.informed or {}).get(name, 0) + int(found.sum()) for name, found in pairs._asdict().items()}
         for name, of in outcomes.items():
             self.tallies[name].add(of)
         for name, members in self.together.items():
@@ -152,7 +156,7 @@ def _blank(job: Job, scenario: Scenario) -> Row:
     return _head(cell, scenario, defence.entry, spec.entry, cell_id(cell)) | {
         "cell": job.identity, "first_seed": cell.first_seed, "dt": scenario.brief().model.dt, "horizon": scenario.horizon,
         "status": "ok", "reason": "", "n": 0, "properties": [], "conjunctions": {}, "verdict": None, "worst": None,
-        "alarms": None,
+        "alarms": None, INFORMS: None,
     }  # fmt: skip
 
 
@@ -163,7 +167,7 @@ def _played(job: Job, loop: Loop, attack: Attack, known: Sequence[Property]) -> 
     together = {name: members for name, members in conjunctions(known, job.formulas).items() if members}
     found = Found({p.name: Tally() for p in known}, together, {name: [] for name in together})
     for start in range(0, cell.seeds, size):
-        outcomes, alarms = _outcomes(job, loop, attack, known, _keys(cell.purpose, tuple(episodes[start : start + size])))
+        outcomes, alarms, pairs = _outcomes(job, loop, attack, known, tuple(episodes[start : start + size]))
         verdict = None
         if job.rule is not None and together:
             trust = np.all([outcomes[name].holds for name in together["trust"]], axis=0)
@@ -171,7 +175,8 @@ def _played(job: Job, loop: Loop, attack: Attack, known: Sequence[Property]) -> 
         if verdict is not None:
             outcomes = {name: Outcome(*(x[: verdict.runs - start] for x in of)) for name, of in outcomes.items()}
             alarms = None if alarms is None else alarms[: verdict.runs - start]
-        found.add(outcomes, alarms)
+            pairs = None if pairs is None else Informed(*(x[: verdict.runs - start] for x in pairs))
+        found.add(outcomes, alarms, pairs)
         if verdict is not None:
             break
     return found
@@ -183,11 +188,19 @@ def _keys(purpose: str, seeds: tuple[int, ...]) -> draws.Keys:
     return draws.keys(purpose, seeds)
 
 
-def _outcomes(job: Job, loop: Loop, attack: Attack, known: Sequence[Property], keys: draws.Keys) -> tuple[dict[str, Outcome], Array | None]:
-    """Play the runs of these keys: outcomes, and false alarms of clean ones."""
-    trace = rollout(loop, attack, keys)
-    priced = job.cell.attack == CLEAN and any(p.name == DETECTS for p in known)
-    return {p.name: outcome(p, trace, job.safe) for p in known}, false_alarms(trace, job.asked.detection) if priced else None
+def _outcomes(
+    job: Job, loop: Loop, attack: Attack, known: Sequence[Property], seeds: tuple[int, ...]
+) -> tuple[dict[str, Outcome], Array | None, Informed | None]:
+    """Play the runs of these seeds: outcomes, false alarms of clean ones, and attacked ones against their twins."""
+    cell, steps = job.cell, job.asked.detection
+    trace = rollout(loop, attack, _keys(cell.purpose, seeds))
+    out, alarms, pairs = {p.name: outcome(p, trace, job.safe) for p in known}, None, None
+    if any(p.name == DETECTS for p in known):
+        if cell.attack == CLEAN:
+            alarms = false_alarms(trace, steps)
+        else:
+            pairs = informed(trace, twin_alarms(cell.defence, cell.scenario, cell.purpose, seeds), steps, loop.horizon)
+    return out, alarms, pairs
 
 
 def _summary(job: Job, known: Sequence[Property], found: Found) -> Row:
@@ -201,6 +214,7 @@ def _summary(job: Job, known: Sequence[Property], found: Found) -> Row:
         "n": n, "properties": [_property(p, found.tallies.get(p.name), job.cell.episodes) for p in known], "conjunctions": together,
         "verdict": None if verdict is None else verdict.holds, "worst": _worst(known, found, job.cell.episodes),
         "alarms": None if found.alarms is None else {"count": found.alarms, "steps": found.tallies[DETECTS].steps},
+        INFORMS: found.informed,
     }  # fmt: skip
 
 

@@ -15,6 +15,7 @@ from tailgate.evaluation.rows import CLEAN
 
 from .cells import Row, runs_of
 from .false_alarms import DETECTS, Price, prices, unpaid
+from .informs import informedness
 from .properties import CONJUNCTIONS
 from .statistics import interval, lower
 
@@ -96,7 +97,9 @@ def _entry(
         known = {level: [row for row in mine if KNOWLEDGE.index(row["knowledge"]) <= KNOWLEDGE.index(level)] for level in KNOWLEDGE}
         out[name] = {level: _bound(known[level], name, alpha, fixed, paid) for level in KNOWLEDGE}
     whole = [row for row in mine if row["status"] == "ok"]
-    return out | {"properties": _properties(whole, alpha, paid), "worst": _failure(whole, names)}
+    more = informedness(whole, alpha)
+    properties = [*_properties(whole, alpha, paid), *([] if more is None else [more])]
+    return out | {"properties": properties, "worst": _failure(whole, names)}
 
 
 def _bound(rows: Sequence[Row], name: str, alpha: float, fixed: bool, paid: Paid) -> Data | None:
