@@ -19,7 +19,7 @@ from tailgate.envs.gym.mixture import Mixture
 from tailgate.play.trace import rollout
 
 DEFENCES = tailgate.list_defences()
-ATTACKS = [name for name in tailgate.list_attacks() if name != "policy"]  # a policy needs a file
+ATTACKS = [name for name in tailgate.list_attacks() if name not in ("policy", "rules")]  # which need a file
 SCENARIOS = list_scenarios()
 ONE = [name for name in SCENARIOS if load_scenario(name).plant.size[0] == 1]  # of many agents: tests/test_contract_many.py
 PLACE = {name: "radar-following-v0" if "probe" in entries("defence")[name].uses else "stop-and-go-v0" for name in DEFENCES}

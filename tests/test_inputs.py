@@ -20,7 +20,7 @@ from tailgate.play.trace import rollout
 
 FLOATS = (-1.0, 0.0, math.nan, math.inf, -math.inf, 1e300, -1e300, 1e-300)
 WHOLE = (-1, 0, 10**30, 1.5)
-FILES = {"policy", "program", "zoo", "profile"}  # whose parameters are files
+FILES = {"policy", "program", "rules", "zoo", "profile"}  # whose parameters are files
 PLACES = ("stop-and-go-v0", "radar-following-v0", "thesis-ch5-v0", "platoon-braking-v0", "scalar-hold-v0", "thesis-ch6-v0", "thesis-ch4-literal-v0")
 GUARDS = ("kf", "dkf", "cra")
 
