@@ -22,7 +22,7 @@ from tailgate.play.trace import rollout
 MANY = ("network-weak-v0", "platoon-braking-v0")
 PLACES = (*MANY, "radar-following-v0")
 DEFENCES = tailgate.list_defences()
-ATTACKS = [name for name in tailgate.list_attacks() if name != "policy"]  # a policy needs a file
+ATTACKS = [name for name in tailgate.list_attacks() if name not in ("policy", "rules")]  # which need a file
 STEPS, ONSET = 12, 4
 
 

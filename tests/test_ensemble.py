@@ -266,7 +266,7 @@ def test_the_command(small, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(standard, "searched", lambda *_: pytest.fail("searched again"))
     assert main([*WORDS, "--out", str(tmp_path)]) == 0
     assert "best of the suite" in capsys.readouterr().out
-    next((tmp_path / "policies").glob("*-grey-*.safetensors")).with_suffix(".json").unlink()
+    next(tmp_path.glob("attacks/*/policies/*-grey-*.safetensors")).with_suffix(".json").unlink()
     with pytest.raises(pytest.fail.Exception, match="searched again"):  # a file that is missing is made again
         main([*WORDS, "--out", str(tmp_path)])
 
@@ -316,3 +316,100 @@ def test_a_class_of_ones_own_is_attacked(small, tmp_path, monkeypatch, capsys):
     scripts, networks = cell["members"]
     assert scripts["attack"] and networks["attack"].startswith("policy:path=found")
     assert "attacked_defence" not in Path(networks["attack"].partition("=")[2]).read_text()
+
+
+def test_a_scenario_of_ones_own(small, tmp_path, monkeypatch):
+    """Its rows carry its name; another content under the same path is searched again; files lie in the folder that was named."""
+    source = (Path(__file__).parents[1] / "configs" / "scenarios" / "radar-braking-v0.yaml").read_text()
+    (tmp_path / "mine.yaml").write_text(source)
+    monkeypatch.setattr(members, "MEMBERS", [one for one in members.MEMBERS if one.name in ("scripts", "networks")])
+    suite = dataclasses.replace(load_suite("radar-v0"), name="custom", scenarios=(str(tmp_path / "mine.yaml"),), doses=(4,), robustness=())
+    report = standard.attack(suite, "chi2_kf", budget="quick", episodes=8, out=tmp_path / "out")
+    (cell,) = report["cells"]
+    assert cell["scenario"] == "mine" and cell["listed"]["episodes"] == 8 and all(one["attack"] for one in cell["members"])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.yaml", "out"]
+    names = [standard.jobs_of(suite, "chi2_kf", (), (), "quick", 0)[0].name]
+    (tmp_path / "mine.yaml").write_text(source.replace("horizon: 120", "horizon: 100"))
+    assert standard.jobs_of(suite, "chi2_kf", (), (), "quick", 0)[0].name != names[0]
+
+
+def test_budgets_share_no_file(small, tmp_path, monkeypatch):
+    """Two budgets in one folder keep their own policies."""
+    monkeypatch.setitem(members.BUDGETS, "standard", members.BUDGETS["quick"])
+    monkeypatch.setattr(members, "MEMBERS", [one for one in members.MEMBERS if one.name == "networks"])
+    suite = load_suite("radar-v0")
+    texts = {
+        budget: standard.attack(
+            suite, "chi2_kf", scenarios=["radar-braking-v0"], doses=[4], budget=budget, episodes=4, out=tmp_path
+        )["cells"][0]["found"]["attack"] for budget in ("quick", "standard")
+    }  # fmt: skip
+    assert len(set(texts.values())) == 2
+
+
+def test_a_defence_that_is_not_traced(small, tmp_path, monkeypatch, capsys):
+    """Scripts and programs are played in the plain loop; who needs derivatives or a program says why it does not search."""
+    (tmp_path / "branching_defence.py").write_text(
+        "from tailgate.estimators import GatedKalman\n\n\nclass Mine(GatedKalman):\n"
+        "    def step(self, plan, state, received, known_u, draws=None):\n"
+        "        if float(received.y.sum()) > 1e30:\n            raise ValueError\n"
+        "        return super().step(plan, state, received, known_u, draws)\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(searching, "FIRST", 2)
+    monkeypatch.setattr(searching, "MORE", 2)
+    monkeypatch.setattr(members, "MEMBERS", [one for one in members.MEMBERS if one.name in ("scripts", "networks", "gradient")])
+    words = [
+        "attack",
+        "branching_defence:Mine",
+        "--scenario",
+        "gusty-stop-and-go-v0",
+        "--budget",
+        "quick",
+        "--episodes",
+        "2",
+        "--workers",
+        "1",
+    ]
+    assert main([*words, "--json"]) == 0
+    scripts, policies, gradients = json.loads(capsys.readouterr().out)["cells"][0]["members"]
+    assert (
+        scripts["attack"]
+        and policies["attack"] is None
+        and "traces" in policies["why"]
+        and gradients["attack"] is None
+        and gradients["why"]
+    )
+
+
+@pytest.mark.parametrize("content", ["[]", "{}", '{"members": [{"found": [{}]}], "listed": null}'])
+def test_the_result_of_a_search_is_checked(content, small, tmp_path, capsys):
+    (job,) = standard.jobs_of(load_suite("radar-v0"), "chi2_kf", ["radar-braking-v0"], [4], "quick", 0)
+    (tmp_path / "searches").mkdir()
+    (tmp_path / "searches" / f"{job.name}.json").write_text(content)
+    assert main([*WORDS, "--out", str(tmp_path)]) == 2 and "remove the file to search again" in capsys.readouterr().err
+
+
+def test_the_result_of_a_search_names_no_code(small, tmp_path, capsys, monkeypatch):
+    (job,) = standard.jobs_of(load_suite("radar-v0"), "chi2_kf", ["radar-braking-v0"], [4], "quick", 0)
+    (tmp_path / "evil_attack.py").write_text("raise SystemExit('executed')\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "searches").mkdir()
+    held = {"members": [{"found": [{"attack": "evil_attack:Evil"}]}], "listed": None}
+    (tmp_path / "searches" / f"{job.name}.json").write_text(json.dumps(held))
+    assert main([*WORDS, "--out", str(tmp_path)]) == 2 and "evil_attack" in capsys.readouterr().err
+
+
+def test_a_threat_model_that_grants_nothing(small, capsys, tmp_path):
+    (tmp_path / "none.yaml").write_text(
+        "scenarios: [gusty-stop-and-go-v0]\ndoses: [12]\ndefences: [kf]\nattacks: [none]\nthreat: {kinds: []}\nseeds: 4\n"
+    )
+    words = ["attack", "kf", "--suite", str(tmp_path / "none.yaml"), "--budget", "quick", "--episodes", "4", "--workers", "1", "--json"]
+    assert main(words) == 0
+    (cell,) = json.loads(capsys.readouterr().out)["cells"]
+    assert cell["found"] is None and all(one["attack"] is None and one["why"] for one in cell["members"])
+
+
+@pytest.mark.parametrize("name", ["a,b", "c[1]", "d:e"])
+def test_a_folder_that_no_text_can_hold(name, tmp_path, capsys):
+    assert main([*WORDS, "--out", str(tmp_path / name)]) == 2 and "--out" in capsys.readouterr().err and not (tmp_path / name).exists()

@@ -74,7 +74,7 @@ def test_what_takes_more_memory_than_is_free_is_refused(monkeypatch: pytest.Monk
         evaluate(defences=["kf"], attacks=["none"], scenarios=["thesis-ch4-v0"], doses=[5], seeds=5_000_000)
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "policy-0.json").write_text("a result")
-    config = train.load_config(None, ["name=a", f"out={tmp_path}", "ppo.envs=5000000", "ppo.batch_size=5000000", "ppo.rollout=1"])
+    config = train.load_config("gusty", ["name=a", f"out={tmp_path}", "ppo.envs=5000000", "ppo.batch_size=5000000", "ppo.rollout=1"])
     with pytest.raises(InputError, match=r"^config\.ppo: size: got 5000000; .* in each of 1 trainings take about .* " + ends):
         train.train(config, lambda *_: None)
     assert [path.name for path in tmp_path.rglob("*")] == ["a", "policy-0.json"]

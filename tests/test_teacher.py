@@ -85,13 +85,13 @@ def test_a_taught_run_resumes_to_the_same_policy(tmp_path: Path) -> None:
         "seeds=1", "workers=1", "environment.interval=20", "ppo.envs=16", "ppo.rollout=15", "ppo.batch_size=120", "ppo.epochs=1", "ppo.hidden=[8]",
         "tensorboard=false", "checkpoint_every=240", f"teacher='{script}'", "white_box=[]", f"scenario={tmp_path / 'brief.yaml'}",
     ]
-    entire = train.load_config(None, [f"out={tmp_path / 'whole'}", "steps=960", *settings])
+    entire = train.load_config("gusty", [f"out={tmp_path / 'whole'}", "steps=960", *settings])
     straight = train.train(entire, lambda seed, now: None)[0].with_suffix(".safetensors").read_bytes()
     parts = [f"out={tmp_path / 'parts'}", *settings]
-    train.train(train.load_config(None, ["steps=480", *parts]), lambda seed, now: None)
-    again = train.train(train.load_config(None, ["steps=960", *parts]), lambda seed, now: None, resume=True)
+    train.train(train.load_config("gusty", ["steps=480", *parts]), lambda seed, now: None)
+    again = train.train(train.load_config("gusty", ["steps=960", *parts]), lambda seed, now: None, resume=True)
     assert again[0].with_suffix(".safetensors").read_bytes() == straight
-    untaught = train.load_config(None, [f"out={tmp_path / 'own'}", "steps=960", *settings, "teacher=none"])
+    untaught = train.load_config("gusty", [f"out={tmp_path / 'own'}", "steps=960", *settings, "teacher=none"])
     assert train.train(untaught, lambda seed, now: None)[0].with_suffix(".safetensors").read_bytes() != straight
 
 
@@ -130,18 +130,18 @@ def test_the_slope_of_an_imitation_is_that_of_its_loss() -> None:
 def test_learners_that_cannot_be_shown_anything_say_so(tmp_path: Path, learner: str) -> None:
     assert not issubclass(learner_of(learner).Learner, Teachable)
     action = "continuous" if learner in ("sac", "tqc") else "mode"
-    config = train.load_config(None, [f"out={tmp_path}", f"learner={learner}", f"environment.action={action}", f"teacher='{SCRIPT}'"])
+    config = train.load_config("gusty", [f"out={tmp_path}", f"learner={learner}", f"environment.action={action}", f"teacher='{SCRIPT}'"])
     with pytest.raises(InputError, match=r"config\.teacher"):
         train.train(config, lambda seed, now: None)
     assert not list(tmp_path.iterdir())
 
 
 def test_what_is_shown_is_one_of_a_few_actions(tmp_path: Path) -> None:
-    config = train.load_config(None, [f"out={tmp_path}", "environment.action=continuous", f"teacher='{SCRIPT}'"])
+    config = train.load_config("gusty", [f"out={tmp_path}", "environment.action=continuous", f"teacher='{SCRIPT}'"])
     with pytest.raises(InputError, match=r"config\.teacher.*timing, mode, ramp"):
         train.train(config, lambda seed, now: None)
     with pytest.raises(InputError, match="nosuch"):
-        train.load_config(None, ["teacher=nosuch"])
+        train.load_config("gusty", ["teacher=nosuch"])
 
 
 @pytest.mark.parametrize(
@@ -154,7 +154,7 @@ def test_what_is_shown_is_one_of_a_few_actions(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_a_teacher_is_a_script_that_knows_no_more(tmp_path: Path, changes: list[str], words: list[str]) -> None:
     """Neither a computed optimum nor a trained policy, nothing that sees more than the learner, and nobody at all is an error, before anything is written."""
-    config = train.load_config(None, [f"out={tmp_path}", *changes])
+    config = train.load_config("gusty", [f"out={tmp_path}", *changes])
     with pytest.raises(InputError) as error:
         train.train(config, lambda seed, now: None)
     assert all(word in str(error.value) for word in words)

@@ -49,6 +49,8 @@ def _print(report: dict[str, Any]) -> None:
         f"rules against {report['defence']} in {report['scenario']}",
     )  # fmt: skip
     lost = report["difference"]
+    if not report["reached"]:
+        say("no tree of these sizes does as much as was asked for: more --leaves, or a larger --loss")
     say(
         f"the rules damage {report['damage']:.1%} of {report['episodes']} report episodes, the policy {report['policy_damage']:.1%}: "
         f"{100 * lost['value']:+.1f} points [{100 * lost['low']:+.1f}, {100 * lost['high']:+.1f}]"

@@ -71,4 +71,4 @@ def _print(report: dict[str, Any]) -> None:
         f"{report['episodes']} report episodes; 95 % intervals",
     )  # fmt: skip
     better = [c for c in report["cells"] if c["found"] and c["listed"] and c["found"]["low"] > c["listed"]["high"]]
-    say(f"the ensemble did more harm than every listed attack in {len(better)} of {len(report['cells'])} cells")
+    say(f"the ensemble did more harm than the strongest listed attack in {len(better)} of {len(report['cells'])} cells")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from typing import Any
 
+MARKS = ",:=[]{}()\"'#"  # characters that mean something in a component's text: a path in it must not hold them
+
 
 def split_text(text: str) -> tuple[str, str]:
     """Return head and parameters of a component's text: `name` and `key=value,...`, or the text and nothing."""

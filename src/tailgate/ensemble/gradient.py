@@ -56,8 +56,6 @@ class Pace:
                 raise InputError(f"pace.{name}", value, "a whole number, at least 1")
 
 
-
-
 def smooth_damage(path: Course, follows: bool, bound: float | None) -> torch.Tensor:
     """Return a smooth measure of damage (B,): high where a gap became small, or, where nobody drives, an error large.
 
@@ -215,7 +213,7 @@ def gradient(arena: Arena, pace: Pace, out: Path, seed: int = 0, tell: Tell | No
     keys = draws.keys("tune", range(after, after + pace.episodes))
     for number, start in enumerate(starts(arena, pace, seed, scripts)):
         injection = Injection(arena.loop, start.when())
-        name = f"{arena.scenario}-{'own' if arena.dose is None else arena.dose}-gradient-{digest([as_data(arena), seed, number])}.yaml"
+        name = f"{arena.name}-{'own' if arena.dose is None else arena.dose}-gradient-{digest([as_data(arena), seed, number])}.yaml"
         path = out / name
 
         def say(turn: int, damage: float, number: int = number, path: Path = path) -> None:

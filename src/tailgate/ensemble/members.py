@@ -13,10 +13,12 @@ from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array
 from tailgate.core.registry import Spec, entries
 from tailgate.core.schema import fields_of
+from tailgate.engine.untraceable import Untraceable
 from tailgate.ensemble.gradient import Pace, gradient
 from tailgate.ensemble.networks import PUBLISHED, Phase, Race, learned, transferred
 from tailgate.ensemble.search import FINALISTS, Arena, Effort, Found, Tell, search
 
+ALIKE = 2  # finalists of a family: others may come from behind
 IMITATED = 2  # scripts that networks imitate at the start
 OPENED = (0.1, 0.25, 0.5, 0.75)  # of the range of gaps: where white boxes begin
 STARTS = 1 + IMITATED + PUBLISHED  # of a race of policies, at most
@@ -71,8 +73,14 @@ class Hunt:
 
 def _scripts(hunt: Hunt) -> list[str]:
     """Search scripts of every family."""
-    hunt.genomes = search(hunt.arena, hunt.arena.space, hunt.budget.scripts, hunt.seed, tell=hunt.tell)
-    return list(dict.fromkeys(map(hunt.arena.space.text, hunt.genomes)))[:FINALISTS]
+    space = hunt.arena.space
+    hunt.genomes = search(hunt.arena, space, hunt.budget.scripts, hunt.seed, tell=hunt.tell)
+    out: dict[str, list[str]] = {}
+    for genome in hunt.genomes:
+        mine = out.setdefault(space.family(genome).name, [])
+        if len(mine) < ALIKE and (text := space.text(genome)) not in mine:
+            mine.append(text)
+    return [text for mine in out.values() for text in mine][:FINALISTS]
 
 
 def _programs(hunt: Hunt) -> list[str]:
@@ -155,7 +163,7 @@ def harvest(hunt: Hunt) -> list[Harvest]:
         try:
             found = hunt.arena.best(member.find(hunt))
             why = "" if found else "the threat model grants nothing for it"
-        except (NotApplicable, ImportError) as error:
+        except (NotApplicable, ImportError, Untraceable) as error:  # not traced: no derivative
             why = str(error)
         hunt.found[member.name] = found
         out.append(Harvest(member.name, member.knowledge, found, why))

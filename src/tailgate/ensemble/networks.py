@@ -161,7 +161,7 @@ class Learner:
             training["config"]["defence"] = arena.defence
         header = header_of(Seat(self.loop, plan.action, plan.observation, Reward(), {}), training)
         knowledge, dose = self.loop.threat.knowledge, "own" if arena.dose is None else arena.dose
-        name = f"{arena.scenario}-{dose}-{knowledge}-{digest([as_data(arena), self.start.name, seed])}"
+        name = f"{arena.name}-{dose}-{knowledge}-{digest([as_data(arena), self.start.name, seed])}"
         return f"policy:path={save_policy(folder / 'policies' / name, Network(weights, biases), header)}"
 
 
@@ -200,6 +200,8 @@ def starts_of(arena: Arena, knowledge: str, scripts: Sequence[str], seed: int) -
         codec, seen = ActionCodec(action_of(arena, scripts), loop.brief), ObservationCodec(loop.brief)
     except InputError as error:
         raise NotApplicable(error.field, error.value, error.expected) from None
+    if codec.size < 2:
+        raise NotApplicable("threat_model.kinds", loop.threat.kinds, "a kind of attack to choose")
     shape = Shape(tuple(itertools.pairwise((len(seen.names), HIDDEN, codec.size))))
 
     def plan(theta: Array) -> PolicyPlan:

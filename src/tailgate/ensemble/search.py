@@ -20,6 +20,7 @@ from tailgate.core import Array, Attack, draws
 from tailgate.core.draws import Keys
 from tailgate.core.loop import Loop
 from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
 from tailgate.engine.agreement import ROWS, Untraced
 from tailgate.ensemble.battery import Played, Scripts, battery_of, played_plainly, remembered
 from tailgate.ensemble.programs import Programs
@@ -35,7 +36,7 @@ PROMISING, KEPT = 8, 48  # one in so many scripts is played on more; scripts tha
 EACH = 8  # scripts of a family that are kept, at most: others may come from behind
 FRESH = 0.25  # share of a generation that is drawn at random
 CHANGED, STEP = 0.3, 0.08  # probability that a gene is changed, and by how much (standard deviation)
-FINALISTS, FINAL = 6, 512  # scripts of the last stage, and its episodes
+FINALISTS, FINAL = 8, 512  # scripts of the last stage, and its episodes
 AT_ONCE = 4096  # episodes of one agent side by side
 
 
@@ -79,6 +80,11 @@ class Arena:
     defence: str
     threat: dict[str, Any]
     bound: float | None  # error that counts as damage where nobody drives
+
+    @cached_property
+    def name(self) -> str:
+        """The name of the scenario, which its rows carry; `scenario` may be a file."""
+        return load_scenario(self.scenario).name
 
     def cell(self, attack: str) -> Cell:
         """Return the cell of an attack here."""

@@ -14,13 +14,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from tailgate.base import sizes, sources
-from tailgate.base.errors import InputError, NotApplicable, unknown
-from tailgate.base.files import write_atomic
+from tailgate.base.errors import InputError, NotApplicable, said, unknown
+from tailgate.base.files import writable_directory, write_atomic
+from tailgate.base.locks import alone
 from tailgate.base.pool import each
 from tailgate.base.reading import load_json
 from tailgate.core.registry import Spec
-from tailgate.core.scenario import Suite
+from tailgate.core.scenario import Suite, load_scenario
 from tailgate.core.schema import digest
+from tailgate.core.spec_text import MARKS
 from tailgate.ensemble.members import BUDGETS, Hunt, harvest
 from tailgate.ensemble.search import FINAL, Arena
 from tailgate.evaluation.cells import Cell, run
@@ -44,8 +46,9 @@ class Job(NamedTuple):
     def name(self) -> str:
         """The name of its file."""
         one = self.arena
-        code = [sources.own(), Spec("defence", one.defence).digest]  # another defence or search under the same name is searched again
-        return f"{one.scenario}-{'own' if one.dose is None else one.dose}-{digest([NAME, *code, *map(str, self)])}"
+        played = load_scenario(one.scenario).config_hash  # another content under the same name is searched again
+        code = [sources.own(), Spec("defence", one.defence).digest, played]
+        return f"{one.name}-{'own' if one.dose is None else one.dose}-{digest([NAME, *code, *map(str, self)])}"
 
 
 def jobs_of(suite: Suite, defence: str, scenarios: Sequence[str], doses: Sequence[int | None], budget: str, seed: int) -> list[Job]:
@@ -86,6 +89,8 @@ def jobs_of(suite: Suite, defence: str, scenarios: Sequence[str], doses: Sequenc
 def expected(jobs: Sequence[Job], workers: int) -> float:
     """Return the seconds that searches take, as the speed of the first one's scripts says."""
     arena = jobs[0].arena
+    if not arena.space.families:
+        return 0.0
     steps = sum(BUDGETS[job.budget].episodes(job.arena.loop.model.agents) * job.arena.loop.horizon for job in jobs)
     return steps / (arena.speed() * arena.loop.horizon) / min(workers, len(jobs))
 
@@ -96,9 +101,9 @@ def searched(job: Job, folder: Path, tell: Callable[[int, int, str, float], None
     folder: where files of attacks are written.
     """
     arena = job.arena
-    members = harvest(Hunt(arena, BUDGETS[job.budget], job.seed, folder, tell))
+    members = harvest(Hunt(arena, BUDGETS[job.budget], job.seed, folder / "attacks" / job.name, tell))
     return {
-        "scenario": arena.scenario, "dose": arena.dose, "listed": _strongest(arena, job.listed),
+        "scenario": arena.name, "place": arena.scenario, "dose": arena.dose, "listed": _strongest(arena, job.listed),
         "members": [one._asdict() | {"found": [found._asdict() for found in one.found[:SHOWN]]} for one in members],
     }  # fmt: skip
 
@@ -152,9 +157,13 @@ def attack(
     sizes.check("workers", workers)
     sizes.check("episodes", episodes)
     update = progress or (lambda *_: None)
+    if out is not None and set(str(out)) & set(MARKS):
+        raise InputError("--out", str(out), f"a path without any of {MARKS}: it stands in the texts of attacks")
     jobs = jobs_of(suite, defence, scenarios, doses, budget, seed)
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory())) if out is None else out
+        if out is not None:
+            stack.enter_context(alone(writable_directory(out, "--out")))
         done = {i: held for i, job in enumerate(jobs) if (held := _kept(job, out)) is not None}
         left = [i for i in range(len(jobs)) if i not in done]
         if announce is not None and left:
@@ -177,7 +186,7 @@ def attack(
                 finish(i, searched(jobs[i], folder, lambda n, of, text, mean, label=label: update(label, n, of, text)))  # type: ignore[misc]
         results = [done[i] for i in range(len(jobs))]
         cells = [
-            Cell(suite.name, one["scenario"], one["dose"], defence, text, episodes, threat=dict(suite.granted))
+            Cell(suite.name, one["place"], one["dose"], defence, text, episodes, threat=dict(suite.granted))
             for one in results for text in dict.fromkeys(_chosen(one))
         ]  # fmt: skip
         rows = run(cells, out / "rows.jsonl" if out is not None else None, workers, lambda n, of: update("report", n, of, ""))
@@ -214,9 +223,14 @@ def _kept(job: Job, out: Path | None) -> dict[str, Any] | None:
         held = load_json(path)
     except (OSError, ValueError) as error:
         raise InputError("--out", str(path), f"the result of a search; remove the file to search again ({error})") from None
-    texts = [found["attack"] for one in held["members"] for found in one["found"]]
-    files = [Path(text.partition("path=")[2]) for text in texts if text.startswith(("program:", "policy:"))]
-    return held if all(file.is_file() for file in files) else None  # a file that was removed is made again
+    try:
+        texts = [found["attack"] for one in held["members"] for found in one["found"]] + [one["attack"] for one in [held["listed"]] if one]
+        for text in texts:
+            Spec("attack", text).refuse_imports("searches")  # only a command line names code
+        files = [Path(text.partition("path=")[2]) for text in texts if text.startswith(("program:", "policy:"))]
+        return held if all(file.is_file() for file in files) else None  # a file that was removed is made again
+    except (KeyError, TypeError, ValueError, InputError) as error:
+        raise InputError("--out", str(path), f"the result of a search; remove the file to search again ({said(error)})") from None
 
 
 def _compared(result: dict[str, Any], rows: list[dict[str, Any]], bound: float | None) -> dict[str, Any]:

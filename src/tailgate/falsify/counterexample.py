@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.base.errors import InputError
+from tailgate.base.errors import InputError, unknown
 from tailgate.base.reading import load_json
 from tailgate.core import Array, draws
 from tailgate.core.registry import Spec
+from tailgate.core.scenario import list_scenarios, list_suites
 from tailgate.falsify.case import PURPOSE, Case
 from tailgate.falsify.claim import Claim
 from tailgate.falsify.road import Numbers, Steered, as_data, from_data, numbers_of
@@ -87,7 +88,7 @@ def _figures(case: Case, trace: Trace) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def replayed(path: Path, defence: str | None = None) -> dict[str, Any]:
+def replayed(path: Path, defence: str | None = None, scenario: str | None = None) -> dict[str, Any]:
     """Play a counterexample again in the plain engine; return its figures, and `same`: if they are the file's.
 
     Parameters
@@ -96,6 +97,8 @@ def replayed(path: Path, defence: str | None = None) -> dict[str, Any]:
         The file.
     defence
         Plays this defence instead of the file's; a class to import is played only if it is named here.
+    scenario
+        Plays in this scenario instead of the file's; a scenario of one's own is played only if it is named here.
 
     Raises
     ------
@@ -113,10 +116,13 @@ def replayed(path: Path, defence: str | None = None) -> dict[str, Any]:
             raise InputError(f"counterexample: {name}", data.get(name), "a text")
     if not isinstance(data.get("threat"), dict) or type(data.get("seed")) is not int or data["seed"] < 0:
         raise InputError("counterexample: threat, seed", [data.get("threat"), data.get("seed")], "a mapping, and a number not below 0")
-    chosen = defence or data["defence"]
+    for name, named, known in (("suite", "", ["", *list_suites()]), ("scenario", scenario, list_scenarios())):
+        if not named and data[name] not in known:
+            raise unknown(f"counterexample: {name}", data[name], known)  # a file does not choose a file
+    chosen, place = defence or data["defence"], scenario or data["scenario"]
     if defence is None:
         Spec("defence", chosen).refuse_imports("counterexample")
-    case = Case(data["suite"], data["scenario"], data.get("dose"), chosen, tuple(data["threat"].items()), data["property"], "none")
+    case = Case(data["suite"], place, data.get("dose"), chosen, tuple(data["threat"].items()), data["property"], "none")
     numbers = from_data(case.slots, data.get("start"), "counterexample: start")
     schedule = schedule_of(data.get("commands"), case.own.brief, "counterexample: commands")
     figures = _figures(case, _played(case, schedule, "none", data["seed"], numbers))

@@ -56,6 +56,7 @@ def falsify(job: Search, out: Path | None = None, progress: Progress | None = No
             "violated": found["robustness"] < 0.0, "seconds": round(time.perf_counter() - started, 2), "counterexample": found,
         }  # fmt: skip
         if out is not None:
-            write_atomic(out / COUNTEREXAMPLE, json.dumps(found, indent=1, allow_nan=False).encode() + b"\n")
+            if report["violated"]:
+                write_atomic(out / COUNTEREXAMPLE, json.dumps(found, indent=1, allow_nan=False).encode() + b"\n")
             write_atomic(out / REPORT, json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
     return report

@@ -5,7 +5,8 @@ Trees play in turn, and the policy says what it would have done in their place. 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ from tailgate.base import sizes
 from tailgate.base.errors import InputError
 from tailgate.core import Array, draws
 from tailgate.core.kinds import EFFECTS
+from tailgate.core.spec_text import MARKS
 from tailgate.envs.gym.actions import Mode
 from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.envs.gym.batches import framed, side_by_side
@@ -162,6 +164,11 @@ def meaning(mode: Mode) -> str:
     return f"{mode.name}, {values}"
 
 
+def leaves_of(node: Split | Leaf) -> list[Leaf]:
+    """Return the leaves below a node."""
+    return [node] if isinstance(node, Leaf) else [*leaves_of(node.above), *leaves_of(node.below)]
+
+
 def distil(
     text: str, out: Path, *, scenario: str | None = None, defence: str | None = None, threat: dict[str, Any] | None = None,
     leaves: int | None = None, loss: float = 0.05, episodes: int = 400, tell: Tell | None = None,
@@ -188,25 +195,49 @@ def distil(
     Returns
     -------
     dict
-        `trees`: what each size damages on select episodes; `rules`, `file`; `policy` and `difference` on report episodes.
+        `trees`: what each size damages on select episodes; `reached`, if the loss is small enough; `rules`, `file`;
+        `policy` and `difference` on report episodes.
     """
     sizes.check("episodes", episodes)
     if leaves is not None and not 2 <= leaves <= 256:
         raise InputError("--leaves", leaves, "a whole number from 2 to 256")
     if not 0.0 <= loss < 1.0:
         raise InputError("--loss", loss, "a share from 0, below 1")
+    if out.suffix != ".json" or set(str(out)) & set(MARKS) or text.endswith(str(out)):
+        raise InputError("--out", str(out), f"a file of its own that ends in .json, its path without any of {MARKS}")
     arena = arena_of(text, scenario, defence, threat)
     counts = (leaves,) if leaves is not None else LEAVES
     goal = float(arena.damage(text, "select", SELECT).mean()) - loss
     actions, names = tuple(mode.name for mode in arena.plan.action.modes), arena.plan.observation.names
     header = header_of(arena.seat, {"summary": f"distilled from {text}", "config": {"scenario": arena.scenario, "defence": arena.defence}})
+    with tempfile.TemporaryDirectory() as folder:
+        trees = _trees(arena, counts, goal, header, Path(folder) / "tree.json", tell)
+    chosen = next((one for one in trees if one.damage >= goal), max(trees, key=lambda one: one.damage))
+    file = save_rules(out, chosen.tree, actions, header)
+    own, theirs = (arena.damage(attack, "report", episodes) for attack in (_attack(file), text))
+    found = paired_difference(own.astype(float), theirs.astype(float), share=True)
+    return {
+        "policy": text, "scenario": arena.scenario, "defence": arena.defence, "file": str(file), "leaves": len(leaves_of(chosen.tree)),
+        "reached": chosen.damage >= goal,
+        "rules": words(chosen.tree, names, tuple(map(meaning, arena.plan.action.modes))), "episodes": episodes,
+        "trees": [{"leaves": one.leaves, "damage": one.damage} for one in trees],
+        "damage": float(own.mean()), "policy_damage": float(theirs.mean()),
+        "difference": {"value": found.value, "low": found.low, "high": found.high},
+    }  # fmt: skip
+
+
+def _trees(
+    arena: Arena, counts: Sequence[int], goal: float, header: dict[str, Any], file: Path, tell: Tell | None
+) -> list[Fitted]:  # fmt: skip
+    """Return the best tree of each size, up to the first that reaches the goal. Trees are played from a file."""
+    actions = tuple(mode.name for mode in arena.plan.action.modes)
     begun, trees = arena.played(arena.teacher, 0), list[Fitted]()
     for i, count in enumerate(counts):
         shown, best = begun, Fitted(count, -1.0, Leaf(0))
         for number in range(1, ROUNDS + 1):
             tree = fitted(shown, count)
-            save_rules(out, tree, actions, header)
-            best = max(best, Fitted(count, float(arena.damage(_attack(out), "select", SELECT).mean()), tree), key=lambda one: one.damage)
+            save_rules(file, tree, actions, header)
+            best = max(best, Fitted(count, float(arena.damage(_attack(file), "select", SELECT).mean()), tree), key=lambda one: one.damage)
             if tell is not None:
                 tell(i * ROUNDS + number, len(counts) * ROUNDS)
             if number < ROUNDS:
@@ -216,17 +247,7 @@ def distil(
         trees.append(best)
         if best.damage >= goal:
             break
-    chosen = next((one for one in trees if one.damage >= goal), max(trees, key=lambda one: one.damage))
-    file = save_rules(out, chosen.tree, actions, header)
-    own, theirs = (arena.damage(attack, "report", episodes) for attack in (_attack(file), text))
-    found = paired_difference(own.astype(float), theirs.astype(float), share=True)
-    return {
-        "policy": text, "scenario": arena.scenario, "defence": arena.defence, "file": str(file), "leaves": chosen.leaves,
-        "rules": words(chosen.tree, names, tuple(map(meaning, arena.plan.action.modes))), "episodes": episodes,
-        "trees": [{"leaves": one.leaves, "damage": one.damage} for one in trees],
-        "damage": float(own.mean()), "policy_damage": float(theirs.mean()),
-        "difference": {"value": found.value, "low": found.low, "high": found.high},
-    }  # fmt: skip
+    return trees
 
 
 def _attack(file: Path) -> str:
