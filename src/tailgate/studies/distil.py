@@ -204,7 +204,7 @@ def distil(
     if not 0.0 <= loss < 1.0:
         raise InputError("--loss", loss, "a share from 0, below 1")
     if out.suffix != ".json" or set(str(out)) & set(MARKS) or text.endswith(str(out)):
-        raise InputError("--out", str(out), f"a file of its own that ends in .json, its path without any of {MARKS}")
+        raise InputError("--out", str(out), f"another file, which ends in .json, its path without any of {MARKS}")
     arena = arena_of(text, scenario, defence, threat)
     counts = (leaves,) if leaves is not None else LEAVES
     goal = float(arena.damage(text, "select", SELECT).mean()) - loss
