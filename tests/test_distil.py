@@ -15,7 +15,7 @@ from tailgate.envs.gym.actions import ActionCodec, ActionSpec
 from tailgate.envs.gym.observations import ObservationCodec
 from tailgate.play.trace import rollout
 from tailgate.studies import distil as distilling
-from tailgate.studies.distil import Shown, arena_of, distil, fitted, words
+from tailgate.studies.distil import Shown, distil, fitted, game_of, words
 
 THREAT = {"kinds": ("dos_jam", "fdi"), "budget": 20, "fdi_bound": 3.0, "knowledge": "black"}
 POLICY = "zoo:name=car-following-chi2_kf-0"
@@ -133,8 +133,8 @@ def test_a_policy_is_distilled(small, tmp_path, capsys):
     assert (
         report["damage"] > 0.2 and report["difference"]["low"] <= report["damage"] - report["policy_damage"] <= report["difference"]["high"]
     )
-    arena = arena_of(POLICY)
-    assert arena.damage(f"rules:path={out}", "report", 60).mean() == report["damage"]
+    game = game_of(POLICY)
+    assert game.damage(f"rules:path={out}", "report", 60).mean() == report["damage"]
     assert distil(POLICY, out, episodes=60)["rules"] == report["rules"]
     assert main(["distil", POLICY, "--out", str(out), "--episodes", "60"]) == 0 and "the rules damage" in capsys.readouterr().out
 

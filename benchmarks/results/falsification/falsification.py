@@ -36,7 +36,7 @@ PARTICLES, RUNS = 500, 10
 
 
 def random_episodes(episodes: int) -> dict[str, Any]:
-    """How many of so many random episodes break the property without an attack, and how far the worst is from it."""
+    """Return how many random episodes break the property without an attack, and how far the worst is from it."""
     case, attack = dataclasses.replace(FAULT, attack="none"), Spec("attack", "none").make()
     least, broken, started = math.inf, 0, time.perf_counter()
     for first in range(0, episodes, AT_ONCE):

@@ -70,5 +70,8 @@ def _print(report: dict[str, Any]) -> None:
         f"{report['defence']} in {report['suite']}: damaged episodes under {report['ensemble']}, budget {report['budget']}",
         f"{report['episodes']} report episodes; 95 % intervals",
     )  # fmt: skip
+    for cell in report["cells"]:
+        for flag in cell["flags"]:
+            say(f"{cell['scenario']}: {flag}: a black box did more damage than the gradients")
     better = [c for c in report["cells"] if c["found"] and c["listed"] and c["found"]["low"] > c["listed"]["high"]]
     say(f"the ensemble did more harm than the strongest listed attack in {len(better)} of {len(report['cells'])} cells")

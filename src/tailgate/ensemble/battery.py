@@ -1,7 +1,6 @@
-"""Many attacks at once, in one compiled program: a script or a program of its own in each row of a batch, or a policy of any weights.
+"""Many attacks at once, in one compiled program. Each row of a batch has another script or program, or all rows have one policy.
 
-The engine traces the loop with an attack whose numbers are part of the state, or parameters of the call. So it compiles once, and plays
-whatever comes.
+The numbers of scripts are part of the state, and the weights of a policy are parameters of the call. So the engine compiles once.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ class Decider(Protocol):
 
 @dataclass(frozen=True)
 class Scripts:
-    """An attack that plays a script of its own in each row, or a program of several phases."""
+    """An attack that plays another script, or another program of two phases, in each row."""
 
     programs: bool = False  # programs have other code than scripts
 
@@ -89,7 +88,7 @@ class Scripts:
         hit = target.any(axis=(1, 2))
         command = Command(np.where(hit, kind, 0).astype(np.int8), target, np.where(target, value, 0.0))
         attacked, phase, elapsed = memory.attacked, memory.phase, count + opened
-        if self.programs:  # the first phase ends after so many attacked steps
+        if self.programs:  # the first phase ends after `length` attacked steps
             attacked = attacked + hit
             over = (attacked >= memory.scripts.length) & (phase == 0)
             phase, opened = phase + over, opened & ~over

@@ -83,7 +83,7 @@ class Start(NamedTuple):
     plan: PolicyPlan
 
 
-class Learner:
+class Evolution:
     """One start: a distribution of weights that moves towards what does more harm."""
 
     def __init__(self, arena: Arena, knowledge: str, start: Start, population: int, seed: int) -> None:
@@ -241,7 +241,7 @@ def learned(
         Where the defence is not traced, as a policy would be learned too slowly, and where there is nothing to choose.
     """
     members = race.members(arena.loop.model.agents)
-    runs = [Learner(arena, knowledge, start, members, seed) for start in starts_of(arena, knowledge, scripts, seed)]
+    runs = [Evolution(arena, knowledge, start, members, seed) for start in starts_of(arena, knowledge, scripts, seed)]
     left, total, done = list(runs), sum(phase.generations for phase in race.phases), 0
     for phase in race.phases:
         episodes = max(phase.episodes // arena.loop.model.agents, FEWEST)

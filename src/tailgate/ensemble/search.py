@@ -32,7 +32,7 @@ from tailgate.play.trace import rollout
 GRADED = 0.1  # weight of the graded score: it says which of two harmless scripts comes nearer to harm
 CLOSE, SHAPED = 6.0, 3.0  # gap that is near to a collision [m]; weight of being near in what a learner is paid
 FIRST, MORE = 16, 48  # episodes of every script of a generation, and more of its best
-PROMISING, KEPT = 8, 48  # one in so many scripts is played on more; scripts that are kept
+PROMISING, KEPT = 8, 48  # one script in PROMISING meets more episodes; scripts that are kept
 EACH = 8  # scripts of a family that are kept, at most: others may come from behind
 FRESH = 0.25  # share of a generation that is drawn at random
 CHANGED, STEP = 0.3, 0.08  # probability that a gene is changed, and by how much (standard deviation)
@@ -48,7 +48,7 @@ class Effort:
     generations: int
 
     def sizes(self, agents: int) -> tuple[int, int, int]:
-        """Return, for so many agents: scripts in a generation, those that meet more episodes, and those that are kept."""
+        """Return, for a system of this size: scripts in a generation, those that meet more episodes, and those that are kept."""
         count, kept = max(self.scripts // agents, 64), max(KEPT // agents, EACH)
         return count, max(count // PROMISING, kept), kept
 

@@ -1,6 +1,6 @@
 """The standard attack ensemble against a defence, in every scenario of a suite at every dose.
 
-Each search is kept in a file of its own, so that an interrupted run goes on. The report compares the best attack of every member with the
+Each search has its own file, so that an interrupted run goes on. The report compares the best attack of every member with the
 best one that the suite lists. All are chosen on select episodes, and played on report episodes.
 """
 
@@ -23,12 +23,14 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_scenario
 from tailgate.core.schema import digest
 from tailgate.core.spec_text import MARKS
-from tailgate.ensemble.members import BUDGETS, Hunt, harvest
-from tailgate.ensemble.search import FINAL, Arena
+from tailgate.ensemble.gradient import gradient_masking
+from tailgate.ensemble.members import BUDGETS, MEMBERS, Hunt, harvest
+from tailgate.ensemble.search import FINAL, Arena, Found
 from tailgate.evaluation.cells import Cell, run
 from tailgate.evaluation.stats import proportion
 
 NAME = "standard-v0"
+BLACK = tuple(member.name for member in MEMBERS if member.knowledge == "black")
 SHOWN = 3  # attacks of a member that are kept
 TRIED, LISTED = 128, 4  # select episodes of every listed attack; listed attacks that are played on as many as the scripts found
 Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
@@ -251,9 +253,13 @@ def _compared(result: dict[str, Any], rows: list[dict[str, Any]], bound: float |
         for one in result["members"]
     ]  # fmt: skip
     best = _best(result)
+    by_member = {one["member"]: Found(**one["found"][0]) for one in result["members"] if one["found"]}
+    black = [found for name, found in by_member.items() if name in BLACK]
+    masked = "gradient" in by_member and gradient_masking(by_member["gradient"], max(black, key=lambda one: one.damage, default=None))
     return {
         "scenario": result["scenario"], "dose": result["dose"], "listed": damage(result["listed"]["attack"] if result["listed"] else None),
         "found": damage(best["attack"] if best else None), "members": members,
+        "flags": ["gradient masking"] if masked else [],
     }  # fmt: skip
 
 

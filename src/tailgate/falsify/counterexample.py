@@ -98,7 +98,7 @@ def replayed(path: Path, defence: str | None = None, scenario: str | None = None
     defence
         Plays this defence instead of the file's; a class to import is played only if it is named here.
     scenario
-        Plays in this scenario instead of the file's; a scenario of one's own is played only if it is named here.
+        Plays in this scenario instead of the file's; a scenario file is read only if it is named here.
 
     Raises
     ------

@@ -56,7 +56,7 @@ class Fitted(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Arena:
+class Game:
     """The game of a policy: where it plays, and what it sees and does."""
 
     scenario: str
@@ -93,7 +93,7 @@ class Arena:
         return np.array([bool(row["crashed"]) for row in rows])
 
 
-def arena_of(text: str, scenario: str | None = None, defence: str | None = None, threat: dict[str, Any] | None = None) -> Arena:
+def game_of(text: str, scenario: str | None = None, defence: str | None = None, threat: dict[str, Any] | None = None) -> Game:
     """Return the game that a policy was trained for, with changes.
 
     Raises
@@ -110,7 +110,7 @@ def arena_of(text: str, scenario: str | None = None, defence: str | None = None,
         raise InputError("--scenario", scenario, "one where somebody drives: rules are compared by collisions")
     if not plan.action.discrete or plan.network.lstm is not None or plan.masked:
         raise InputError("policy", text, "one with discrete decisions, and without a memory or a mask")
-    return Arena(scenario, defence, changes, Seat(loop, plan.action, plan.observation, Reward(), {}), plan)
+    return Game(scenario, defence, changes, Seat(loop, plan.action, plan.observation, Reward(), {}), plan)
 
 
 def fitted(shown: Shown, leaves: int) -> Split | Leaf:
@@ -205,21 +205,21 @@ def distil(
         raise InputError("--loss", loss, "a share from 0, below 1")
     if out.suffix != ".json" or set(str(out)) & set(MARKS) or text.endswith(str(out)):
         raise InputError("--out", str(out), f"another file, which ends in .json, its path without any of {MARKS}")
-    arena = arena_of(text, scenario, defence, threat)
+    game = game_of(text, scenario, defence, threat)
     counts = (leaves,) if leaves is not None else LEAVES
-    goal = float(arena.damage(text, "select", SELECT).mean()) - loss
-    actions, names = tuple(mode.name for mode in arena.plan.action.modes), arena.plan.observation.names
-    header = header_of(arena.seat, {"summary": f"distilled from {text}", "config": {"scenario": arena.scenario, "defence": arena.defence}})
+    goal = float(game.damage(text, "select", SELECT).mean()) - loss
+    actions, names = tuple(mode.name for mode in game.plan.action.modes), game.plan.observation.names
+    header = header_of(game.seat, {"summary": f"distilled from {text}", "config": {"scenario": game.scenario, "defence": game.defence}})
     with tempfile.TemporaryDirectory() as folder:
-        trees = _trees(arena, counts, goal, header, Path(folder) / "tree.json", tell)
+        trees = _trees(game, counts, goal, header, Path(folder) / "tree.json", tell)
     chosen = next((one for one in trees if one.damage >= goal), max(trees, key=lambda one: one.damage))
     file = save_rules(out, chosen.tree, actions, header)
-    own, theirs = (arena.damage(attack, "report", episodes) for attack in (_attack(file), text))
+    own, theirs = (game.damage(attack, "report", episodes) for attack in (_attack(file), text))
     found = paired_difference(own.astype(float), theirs.astype(float), share=True)
     return {
-        "policy": text, "scenario": arena.scenario, "defence": arena.defence, "file": str(file), "leaves": len(leaves_of(chosen.tree)),
+        "policy": text, "scenario": game.scenario, "defence": game.defence, "file": str(file), "leaves": len(leaves_of(chosen.tree)),
         "reached": chosen.damage >= goal,
-        "rules": words(chosen.tree, names, tuple(map(meaning, arena.plan.action.modes))), "episodes": episodes,
+        "rules": words(chosen.tree, names, tuple(map(meaning, game.plan.action.modes))), "episodes": episodes,
         "trees": [{"leaves": one.leaves, "damage": one.damage} for one in trees],
         "damage": float(own.mean()), "policy_damage": float(theirs.mean()),
         "difference": {"value": found.value, "low": found.low, "high": found.high},
@@ -227,22 +227,22 @@ def distil(
 
 
 def _trees(
-    arena: Arena, counts: Sequence[int], goal: float, header: dict[str, Any], file: Path, tell: Tell | None
+    game: Game, counts: Sequence[int], goal: float, header: dict[str, Any], file: Path, tell: Tell | None
 ) -> list[Fitted]:  # fmt: skip
     """Return the best tree of each size, up to the first that reaches the goal. Trees are played from a file."""
-    actions = tuple(mode.name for mode in arena.plan.action.modes)
-    begun, trees = arena.played(arena.teacher, 0), list[Fitted]()
+    actions = tuple(mode.name for mode in game.plan.action.modes)
+    begun, trees = game.played(game.teacher, 0), list[Fitted]()
     for i, count in enumerate(counts):
         shown, best = begun, Fitted(count, -1.0, Leaf(0))
         for number in range(1, ROUNDS + 1):
             tree = fitted(shown, count)
             save_rules(file, tree, actions, header)
-            best = max(best, Fitted(count, float(arena.damage(_attack(file), "select", SELECT).mean()), tree), key=lambda one: one.damage)
+            best = max(best, Fitted(count, float(game.damage(_attack(file), "select", SELECT).mean()), tree), key=lambda one: one.damage)
             if tell is not None:
                 tell(i * ROUNDS + number, len(counts) * ROUNDS)
             if number < ROUNDS:
                 rules = Tree(tree, len(actions))
-                more = arena.played(lambda seen, rules=rules: np.argmax(rules(seen), axis=1), number * SHOWN)  # type: ignore[misc]
+                more = game.played(lambda seen, rules=rules: np.argmax(rules(seen), axis=1), number * SHOWN)  # type: ignore[misc]
                 shown = Shown(*(np.concatenate(parts) for parts in zip(shown, more, strict=True)))
         trees.append(best)
         if best.damage >= goal:
