@@ -298,7 +298,7 @@ def test_a_run_that_was_killed_and_resumed_gives_the_policy_of_an_uninterrupted_
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_run: tuple[str, ...]
 ) -> None:
     """SIGKILL in the middle of a rollout, at no moment that the program chose."""
-    long_run = [*small_run, "steps=5120", "checkpoint_every=640"]
+    long_run = [*small_run, "steps=15360", "checkpoint_every=640"]  # long enough to be killed in, also where programs are cached
     for name in ("straight", "killed"):
         (tmp_path / name).mkdir()
     monkeypatch.chdir(tmp_path / "straight")
