@@ -214,3 +214,20 @@ def asked(browser):
         return {url for url in urls if not url.startswith("data:")}
 
     return addresses
+
+
+@pytest.fixture
+def small_ensemble(monkeypatch):
+    """The standard attack ensemble at a size that a test can pay for."""
+    from tailgate.ensemble import members, networks, standard
+    from tailgate.ensemble import search as searching
+
+    effort = searching.Effort(64, 3)
+    budget = members.Budget(effort, effort, 6, ((2, 8), (1, 8)), members.Pace(16, 1, 1, 8))
+    monkeypatch.setitem(members.BUDGETS, "quick", budget)
+    for name, value in (("JUDGED", 64), ("SHOWN", 8), ("COPIED", 64)):
+        monkeypatch.setattr(networks, name, value)
+    monkeypatch.setattr(members, "FINALISTS", 1)
+    for name, value in (("FINAL", 16), ("MORE", 8), ("KEPT", 8)):
+        monkeypatch.setattr(searching, name, value)
+    monkeypatch.setattr(standard, "FINAL", 16)

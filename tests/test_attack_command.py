@@ -7,26 +7,9 @@ from pathlib import Path
 import pytest
 
 from tailgate.cli import main
-from tailgate.core.scenario import load_suite
-from tailgate.ensemble import members, networks, standard
+from tailgate.core.scenario import Suite, load_suite
+from tailgate.ensemble import members, standard
 from tailgate.ensemble import search as searching
-from tailgate.ensemble.gradient import Pace
-from tailgate.ensemble.members import Budget
-from tailgate.ensemble.search import Effort
-
-SMALL = Effort(64, 3)
-
-
-@pytest.fixture
-def small(monkeypatch):
-    monkeypatch.setitem(members.BUDGETS, "quick", Budget(SMALL, SMALL, 6, ((2, 8), (1, 8)), Pace(16, 1, 1, 8)))
-    for name, value in (("JUDGED", 64), ("SHOWN", 8), ("COPIED", 64)):
-        monkeypatch.setattr(networks, name, value)
-    monkeypatch.setattr(members, "FINALISTS", 1)
-    for name, value in (("FINAL", 16), ("MORE", 8), ("KEPT", 8)):
-        monkeypatch.setattr(searching, name, value)
-    monkeypatch.setattr(standard, "FINAL", 16)
-
 
 WORDS = [
     "attack",
@@ -46,7 +29,7 @@ WORDS = [
 ]
 
 
-def test_the_command(small, tmp_path, capsys, monkeypatch):
+def test_the_command(small_ensemble, tmp_path, capsys, monkeypatch):
     """It compares with the suite's attacks, writes scripts that `evaluate` plays, and goes on where it was ended."""
     assert main([*WORDS, "--out", str(tmp_path), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
@@ -67,7 +50,7 @@ def test_the_command(small, tmp_path, capsys, monkeypatch):
     assert own["gradient"]["why"] == "the threat model grants nothing for it"
     for one in own.values():
         assert one["attack"] is None or sum(row["crashed"] for row in rows if row["attack"] == one["attack"]) / 20 == one["damage"]
-    monkeypatch.setattr(standard, "searched", lambda *_: pytest.fail("searched again"))
+    monkeypatch.setattr(standard, "search", lambda *_: pytest.fail("searched again"))
     assert main([*WORDS, "--out", str(tmp_path)]) == 0
     assert "best of the suite" in capsys.readouterr().out
     next(tmp_path.glob("attacks/*/policies/*-grey-*.safetensors")).with_suffix(".json").unlink()
@@ -109,7 +92,7 @@ def test_another_defence_of_the_same_name_is_searched_again(tmp_path, monkeypatc
     assert names[0] != names[1]
 
 
-def test_a_class_of_ones_own_is_attacked(small, tmp_path, monkeypatch, capsys):
+def test_a_class_of_ones_own_is_attacked(small_ensemble, tmp_path, monkeypatch, capsys):
     """The file of a policy does not name it, so that nobody who reads the file imports it."""
     (tmp_path / "attacked_defence.py").write_text("from tailgate.estimators import GatedKalman\n\n\nclass Mine(GatedKalman):\n    pass\n")
     monkeypatch.chdir(tmp_path)
@@ -122,7 +105,7 @@ def test_a_class_of_ones_own_is_attacked(small, tmp_path, monkeypatch, capsys):
     assert "attacked_defence" not in Path(networks["attack"].partition("=")[2]).read_text()
 
 
-def test_a_scenario_of_ones_own(small, tmp_path, monkeypatch):
+def test_a_scenario_of_ones_own(small_ensemble, tmp_path, monkeypatch):
     """Its rows carry its name; another content under the same path is searched again; files lie in the folder that was named."""
     source = (Path(__file__).parents[1] / "configs" / "scenarios" / "radar-braking-v0.yaml").read_text()
     (tmp_path / "mine.yaml").write_text(source)
@@ -137,7 +120,7 @@ def test_a_scenario_of_ones_own(small, tmp_path, monkeypatch):
     assert standard.jobs_of(suite, "chi2_kf", (), (), "quick", 0)[0].name != names[0]
 
 
-def test_budgets_share_no_file(small, tmp_path, monkeypatch):
+def test_budgets_share_no_file(small_ensemble, tmp_path, monkeypatch):
     """Two budgets in one folder keep their own policies."""
     monkeypatch.setitem(members.BUDGETS, "standard", members.BUDGETS["quick"])
     monkeypatch.setattr(members, "MEMBERS", [one for one in members.MEMBERS if one.name == "networks"])
@@ -150,7 +133,7 @@ def test_budgets_share_no_file(small, tmp_path, monkeypatch):
     assert len(set(texts.values())) == 2
 
 
-def test_a_defence_that_is_not_traced(small, tmp_path, monkeypatch, capsys):
+def test_a_defence_that_is_not_traced(small_ensemble, tmp_path, monkeypatch, capsys):
     """Scripts and programs are played in the plain loop; who needs derivatives or a program says why it does not search."""
     (tmp_path / "branching_defence.py").write_text(
         "from tailgate.estimators import GatedKalman\n\n\nclass Mine(GatedKalman):\n"
@@ -187,14 +170,14 @@ def test_a_defence_that_is_not_traced(small, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("content", ["[]", "{}", '{"members": [{"found": [{}]}], "listed": null}'])
-def test_the_result_of_a_search_is_checked(content, small, tmp_path, capsys):
+def test_the_result_of_a_search_is_checked(content, small_ensemble, tmp_path, capsys):
     (job,) = standard.jobs_of(load_suite("radar-v0"), "chi2_kf", ["radar-braking-v0"], [4], "quick", 0)
     (tmp_path / "searches").mkdir()
     (tmp_path / "searches" / f"{job.name}.json").write_text(content)
     assert main([*WORDS, "--out", str(tmp_path)]) == 2 and "remove the file to search again" in capsys.readouterr().err
 
 
-def test_the_result_of_a_search_names_no_code(small, tmp_path, capsys, monkeypatch):
+def test_the_result_of_a_search_names_no_code(small_ensemble, tmp_path, capsys, monkeypatch):
     (job,) = standard.jobs_of(load_suite("radar-v0"), "chi2_kf", ["radar-braking-v0"], [4], "quick", 0)
     (tmp_path / "evil_attack.py").write_text("raise SystemExit('executed')\n")
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -204,7 +187,7 @@ def test_the_result_of_a_search_names_no_code(small, tmp_path, capsys, monkeypat
     assert main([*WORDS, "--out", str(tmp_path)]) == 2 and "evil_attack" in capsys.readouterr().err
 
 
-def test_a_threat_model_that_grants_nothing(small, capsys, tmp_path):
+def test_a_threat_model_that_grants_nothing(small_ensemble, capsys, tmp_path):
     (tmp_path / "none.yaml").write_text(
         "scenarios: [gusty-stop-and-go-v0]\ndoses: [12]\ndefences: [kf]\nattacks: [none]\nthreat: {kinds: []}\nseeds: 4\n"
     )
@@ -233,5 +216,5 @@ def test_gradients_that_do_less_than_a_black_box_are_flagged(white, flags):
         member("gradient", "white", white),
     ]
     result = {"scenario": "somewhere", "dose": 4, "listed": None, "members": members_of}
-    assert standard._compared(result, [], None)["flags"] == flags
-    assert standard._compared(result | {"members": members_of[:3]}, [], None)["flags"] == []
+    assert standard._compared(result, [], Suite())["flags"] == flags
+    assert standard._compared(result | {"members": members_of[:3]}, [], Suite())["flags"] == []

@@ -55,7 +55,8 @@ def as_evaluated(place, text):
     attack = spec.make()
     trace = rollout(place.seat(spec.entry.knowledge, attack), attack, draws.keys("tune", range(EPISODES)))
     gap = METRICS["min_gap"](trace) if place.loop.model.followers.any() else np.full(EPISODES, np.inf)
-    return Played(METRICS["crashed"](trace) > 0, gap, METRICS["max_error"](trace)), bool((trace.kind != 0).any())
+    others = (METRICS[name](trace) for name in ("max_error", "distance_travelled"))
+    return Played(METRICS["crashed"](trace) > 0, gap, *others), bool((trace.kind != 0).any())
 
 
 def assert_same(place, found, wanted, text):
@@ -65,6 +66,7 @@ def assert_same(place, found, wanted, text):
         first = place.loop.plant.scene(place.loop.plan.plant, place.loop.start(draws.keys("tune", range(EPISODES))).plant)
         before = np.min(first.gap[:, place.loop.model.followers], axis=1)
         assert np.array_equal(np.minimum(found.gap, before), wanted.gap), text
+        assert np.array_equal(found.moved, wanted.moved), text
     else:
         assert np.array_equal(found.error, wanted.error), text
 

@@ -1,4 +1,4 @@
-"""Attackers of a suite's plan trained against a defence, and played on it: what a board asks for before it ranks."""
+"""Attackers of a suite's plan made against a defence, and played on it: what a board asks for before it ranks."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from tailgate.base.errors import InputError
 from tailgate.base.progress import cells
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite
 from tailgate.evaluation.cells import evaluate
 from tailgate.sandbox import play_submission
-from tailgate.training.adaptive import configs_of, fitting, policies_of, stem, train_against
+from tailgate.training.adaptive import configs_of, fitting, plan_of, policies_of, stem, train_against
+
+from .searched import attacks_of, search
 
 Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
 
@@ -29,16 +32,25 @@ def attack(
     suite: Suite, defence: str, out: Path, *, seeds: int | None = None, episodes: int | None = None, beacon: str = "", workers: int = 1,
     changes: tuple[str, ...] = (), progress: Progress, counting: Callable[[Progress], Progress] = lambda told: told,
 ) -> Attacked:  # fmt: skip
-    """Train a suite's attackers against a defence, and play them on it. Finished work is neither trained nor played again.
+    """Make a suite's attackers against a defence, and play them on it. Finished work is neither made nor played again.
 
-    Policies go to out/policies, rows to out/DEFENCE*.jsonl. seeds, episodes: instead of the suite's; beacon: the round; changes: key=value
-    of the training; counting: of the cells that are played. Raises InputError for a suite without a plan.
+    Policies go to out/policies, rows to out/DEFENCE*.jsonl, what the ensemble found to out/found. seeds, episodes: instead of the suite's;
+    beacon: the round; changes: key=value of the training; counting: of the cells that are played. Raises InputError for a suite without a
+    plan.
     """
+    plan = plan_of(suite)
+    if plan.ensemble and not plan.learners and (changes or seeds is not None):
+        field, value = ("--set", changes[0]) if changes else ("--seeds", seeds)
+        raise InputError(field, value, f"no such option, as {suite.name} asks for a search and for no training")
     configs = configs_of(suite, defence, out / "policies", seeds=seeds, extra=(*changes, f"workers={workers}"))
     policies = train_against(configs, progress)
     groups: dict[tuple[str, ...], list[str]] = {}  # a policy plays where the attacker sees and may do what it learned with
     for config in configs:
         groups.setdefault(fitting(suite, config), []).extend(map(str, policies_of(config)))
+    if plan.ensemble:
+        found = search(suite, defence, out, workers=workers, progress=progress)
+        for scenario, texts in attacks_of(found).items():
+            groups.setdefault((scenario,), []).extend(text for text in texts if text not in suite.attacks)
     files, count, counted = [], 0, counting(progress)
     for scenarios, attacks in groups.items():
         files.append(out / f"{stem(defence)}{f'-{scenarios[0]}' if len(groups) > 1 else ''}.jsonl")

@@ -112,7 +112,10 @@ def _scored(data: Data, rows: list[Row], suite: Suite) -> Iterator[Data]:
     lines = [build(Admitted, a["admitted"], "board: attacks") for a in data["attacks"] if a.get("admitted")]
     try:
         adaptive = said.get("require_adaptive", True)
-        here = score(rows, suite, attacks=lines, alpha=said.get("alpha", 0.05), require_adaptive=adaptive, shared=shared_of(data))
+        here = score(
+            rows, suite, attacks=lines, alpha=said.get("alpha", 0.05), require_adaptive=adaptive, shared=shared_of(data),
+            searches=data.get("searches", ()),
+        )  # fmt: skip
     except InputError as error:
         yield {"defence": "", "field": "cells", "board": f"{len(data['cells'])} cells", "here": str(error)}
         return

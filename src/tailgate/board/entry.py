@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from tailgate.core.spec_text import split_text
 from tailgate.evaluation.paired import class_of
 from tailgate.evaluation.rounds import numbered
 from tailgate.evaluation.rows import CLEAN, Row
-from tailgate.training.adaptive import Asked
+from tailgate.training.adaptive import Asked, plan_of
 
 from .damage import PLAYED, Key, Table, doses_of, has_road, named
 from .flags import flags, of_attacks, standing
@@ -21,6 +21,7 @@ from .gates import failure, gates
 from .measures import extended as later
 from .measures import mean_gap, pointwise, under_attack
 from .schema import Data
+from .searched import unsearched
 from .worst import Worst
 
 CLEAN_METRICS = (
@@ -43,8 +44,15 @@ def shown(suite: Suite) -> list[int]:
     return [i for i, dose in enumerate(doses) if dose in suite.shown] or list(range(len(doses)))
 
 
-def entry_of(table: Table, defence: str, levels: dict[str, Worst], dose: int, origins: dict[str, Row], asked: list[Asked] | None) -> Data:
-    """Return the entry of a defence that is made of rows: status, gates, flags, worst episode and figures."""
+def entry_of(
+    table: Table, defence: str, levels: dict[str, Worst], dose: int, origins: dict[str, Row], trained: dict[str, str],
+    asked: list[Asked] | None, searches: Sequence[Data],
+) -> Data:  # fmt: skip
+    """Return the entry of a defence that is made of rows: status, gates, flags, worst episode and figures.
+
+    origins: how each learned attack was trained; trained: the defence that an attack was made against; asked: the suite's trainings, None
+    where a rank asks for no attack that was made against the defence; searches: what the standard ensemble found.
+    """
     rows = [row for key in sorted(table.cells) if key.defence == defence for row in table.cells[key]]
     uses = [str(use) for use in rows[0]["uses"]]
     card = _card(defence)
@@ -55,13 +63,13 @@ def entry_of(table: Table, defence: str, levels: dict[str, Worst], dose: int, or
         status, why = "unranked", short
     if not why and card is None and (how := _claimed(rows)):
         status, why = "unranked", how
-    if not why and asked is not None and (missing := _unmet(table, defence, origins, asked)):
+    if not why and asked is not None and (missing := _unmet(table, defence, origins, asked, searches)):
         status, why = "unattacked", missing
     whole = {k: worst for k, worst in levels.items() if worst.complete}
     return {
         "defence": defence, "card": None if card is None else card.card(), "uses": uses, "class": class_of(uses),
         "status": status, "why": why, "gates": found, "rank": None, "clean": _clean(table, defence),
-        "flags": flags(table, defence, levels, dose, origins), "worst_episode": _episode(table, whole, dose), "stealth": None,
+        "flags": flags(table, defence, levels, dose, origins, trained), "worst_episode": _episode(table, whole, dose), "stealth": None,
     } | of_worst(table, levels, dose) | (_measures(table, defence, whole) if table.suite.measures else {})  # fmt: skip
 
 
@@ -169,8 +177,8 @@ def _claimed(rows: list[Row]) -> str:
     return "" if all(row.get("beacon") for row in rows) else f"{CLAIMED}: played on public seeds"
 
 
-def _unmet(table: Table, defence: str, origins: dict[str, Row], asked: list[Asked]) -> str:
-    """Return the suite's own trainings against a defence that are missing; empty where none is.
+def _unmet(table: Table, defence: str, origins: dict[str, Row], asked: list[Asked], searches: Sequence[Data]) -> str:
+    """Return the suite's own searches and trainings against a defence that are missing; empty where none is.
 
     asked: every scenario that is trained on, learner, knowledge and training seed of a suite with a plan (`adaptive`). Each has to be
     trained as the plan says, against these very files and this version of the defence, and played wherever the policy fits. A suite without
@@ -179,6 +187,11 @@ def _unmet(table: Table, defence: str, origins: dict[str, Row], asked: list[Aske
     """
     index = table.defences.index(defence)
     row = next(rows[0] for key, rows in table.cells.items() if key.defence == defence)
+    plan = plan_of(table.suite) if table.suite.adaptive else None
+    if plan is not None and plan.ensemble and (missing := unsearched(table, row, searches, plan)):
+        return missing
+    if plan is not None and not plan.learners:
+        return ""
     own = defence, row["defence_digest"], row.get("versions", {}).get("defence", 1)
     met = [
         (origins[attacker.attack], {name for name in table.scenarios if (table.state[name][index, i] == PLAYED).all()})
@@ -193,8 +206,8 @@ def _unmet(table: Table, defence: str, origins: dict[str, Row], asked: list[Aske
     if not asked:
         return ""
     found = {(origin["plan"], origin["seed"]): played for origin, played in met}
-    missing = [f"{name} seed {seed}" for name, plan, seed, where in asked if not found.get((plan, seed), set()) >= set(where)]
-    return f"{len(missing)} of {len(asked)} of the suite's own trainings are missing, first {missing[0]}" if missing else ""
+    left = [f"{name} seed {seed}" for name, plan, seed, where in asked if not found.get((plan, seed), set()) >= set(where)]
+    return f"{len(left)} of {len(asked)} of the suite's own trainings are missing, first {left[0]}" if left else ""
 
 
 def _clean(table: Table, defence: str) -> dict[str, Data]:

@@ -21,9 +21,13 @@ BEATEN = "black box beats grey and white box: those who know more were not made 
 SPREAD = 0.2  # between the training seeds of one plan, of the share of damage
 
 
-def flags(table: Table, defence: str, levels: dict[str, Worst], dose: int, origins: dict[str, Row]) -> list[str]:
-    """Return the flags of one entry; `origins` says how each learned attack was trained, as far as that is known."""
-    trained = {attack: str(origin["defence"]) for attack, origin in origins.items()}
+def flags(
+    table: Table, defence: str, levels: dict[str, Worst], dose: int, origins: dict[str, Row], trained: dict[str, str]
+) -> list[str]:  # fmt: skip
+    """Return the flags of one entry.
+
+    origins: how each learned attack was trained, as far as that is known; trained: the defence that an attack was made against.
+    """
     return [*of_attacks(table, defence, levels, dose, trained), *_trainings(table, defence, dose, origins)]
 
 

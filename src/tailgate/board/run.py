@@ -23,6 +23,7 @@ from .cells import shared_of
 from .files import agree, load, read_board, read_json, save
 from .schema import Data
 from .score import score
+from .searched import searches_in
 from .update import with_kept
 from .verified import digest, with_verified
 
@@ -72,7 +73,7 @@ def files_of_rows(folder: Path) -> list[Path]:
     """Return files of rows in a suite's folder, without those of policies, of trust and hidden ones."""
     found = sorted(path for path in folder.glob("**/*") if path.name.endswith((".jsonl", ".jsonl.xz")) and path.name != LIST)
     within = [(path, path.relative_to(folder).parts) for path in found]
-    others = {"policies", TRUST}
+    others = {"policies", "searches", TRUST}
     return [path for path, parts in within if not others & set(parts) and not any(part.startswith(".") for part in parts)]
 
 
@@ -105,7 +106,7 @@ def board_of(
         raise InputError("rows: version", min(other), f"{VERSION}, as the board's")
     board = score(
         (row for rows in parts.values() for row in rows), suite, attacks=list_of(suite, folder / LIST),
-        board=before if keep else None, require_adaptive=require_adaptive,
+        board=before if keep else None, require_adaptive=require_adaptive, searches=searches_in(folder),
     )  # fmt: skip
     if beacon is not None and board["suite"]["beacon"] != beacon:
         raise InputError("beacon", beacon, f"that of the rows, {board['suite']['beacon'] or 'which are of public seeds'}")

@@ -370,6 +370,34 @@ class Trust(Part):
     properties: list[TrustProperty] = []
 
 
+class SearchedMember(Part):
+    """What a member of the ensemble found in a cell: damage on select episodes; the attack where it is played."""
+
+    member: Text
+    knowledge: Level
+    why: Text = ""  # why it found nothing
+    damage: Share | None
+    attack: Text | None
+
+
+class SearchedCell(Part):
+    scenario: Text
+    dose: Dose
+    listed: Share | None  # damage of the suite's best attack, on the same episodes
+    members: list[SearchedMember]
+
+
+class SearchedLine(Part):
+    """What the standard attack ensemble found against a defence."""
+
+    defence: Text
+    digest: Text
+    version: Count
+    ensemble: Text
+    budget: Text
+    cells: list[SearchedCell]
+
+
 class Board(Part):
     """A suite's ranked results. `entries` are its defences; `cells` are what their figures are made of."""
 
@@ -380,6 +408,7 @@ class Board(Part):
     cells: list[CellLine] = []
     curves: list[Curve] = []
     comparisons: list[Comparison] = []
+    searches: list[SearchedLine] = []
     detection: Detection | None = None
     trust: Trust | None = None
 

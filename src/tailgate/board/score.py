@@ -19,13 +19,14 @@ from .damage import SKIPPED, Attacker, Table, tabulate
 from .entry import Levels, curves, entry_of, extended, middle
 from .ranks import rank
 from .schema import FORMAT, Data
+from .searched import found_for
 from .update import KeptPart, kept_part
 from .worst import Worst
 
 
 def score(
     rows: Iterable[Row], suite: Suite, *, attacks: Sequence[Admitted] | None = None, alpha: float = 0.05, require_adaptive: bool = True,
-    board: Data | None = None, shared: Sequence[str] = (),
+    board: Data | None = None, shared: Sequence[str] = (), searches: Sequence[Data] = (),
 ) -> Data:  # fmt: skip
     """Return the board of a suite from its rows, in the format of decision record 14. The order of the rows changes nothing.
 
@@ -39,6 +40,8 @@ def score(
         An earlier board of the suite: its other entries stay (`update.kept_part`), and ranks are made of both.
     shared
         Attacks on no list that every defence has to have met (`cells.shared_of`).
+    searches
+        What the standard ensemble found (`searched.searches_in`), where the suite asks for it.
 
     Raises
     ------
@@ -64,21 +67,23 @@ def score(
     asked = asked_of(suite) if require_adaptive and suite.adaptive else [] if require_adaptive else None
     added: dict[str, frozenset[str]] = {} if held is None else held.added
     trained = {} if board is None else {a["attack"]: a["trained_on"] for a in board["attacks"] if a.get("trained_on")}
-    trained |= {attack: str(origin["defence"]) for attack, origin in origins.items()}
+    lines_of = {line["defence"]: line for line in (*searches, *(held.board.get("searches", ()) if held else ()))}
+    searches = [lines_of[d] for d in table.defences if d in lines_of]  # an entry that stays keeps its own
+    trained |= {attack: str(origin["defence"]) for attack, origin in origins.items()} | found_for(searches)
     found = [
         extended(kept[d], table, levels[d], dose, trained, added[d]) if d in added else dict(kept[d]) if d in kept
-        else entry_of(table, d, levels[d], dose, origins, asked) for d in table.defences
+        else entry_of(table, d, levels[d], dose, origins, trained, asked, searches) for d in table.defences
     ]  # fmt: skip
     cells = ordered([*cells_of(table), *(held.cells if held else ())], table)
     return {
         "format": FORMAT, "suite": _suite(table, alpha) | {"require_adaptive": require_adaptive},
-        "attacks": _attacks(table, lines, origins, cells, held), "entries": found, "cells": cells,
+        "attacks": _attacks(table, lines, trained, cells, held), "entries": found, "cells": cells,
         "curves": [
             curve for d in table.defences
             for curve in (held.of("curves", d) if held is not None and d in kept and d not in added else curves(levels[d]))
         ],
         "comparisons": rank(found, levels, dose, alpha, held), "detection": None,
-    } | ({"trust": board["trust"]} if board is not None and board.get("trust") else {})  # fmt: skip
+    } | {name: held for name, held in (("searches", searches), ("trust", (board or {}).get("trust"))) if held}  # fmt: skip
 
 
 def _suite(table: Table, alpha: float) -> Data:
@@ -95,7 +100,7 @@ def _suite(table: Table, alpha: float) -> Data:
 
 
 def _attacks(
-    table: Table, lines: dict[str, Admitted | None], origins: dict[str, Row], cells: list[Data], held: KeptPart | None
+    table: Table, lines: dict[str, Admitted | None], trained: dict[str, str], cells: list[Data], held: KeptPart | None
 ) -> list[Data]:  # fmt: skip
     out = []
     told = {} if held is None else {attack["attack"]: attack for attack in held.board["attacks"]}
@@ -109,7 +114,7 @@ def _attacks(
         out.append({
             "attack": attacker.attack, "knowledge": attacker.knowledge,
             "learned": table.learned[attacker], "optimal": table.optimal[attacker],
-            "trained_on": origins.get(attacker.attack, {}).get("defence") or told.get(attacker.attack, {}).get("trained_on"),
+            "trained_on": trained.get(attacker.attack),
             "digest": told.get(attacker.attack, {}).get("digest") or files.get(attacker.attack) or None,
             "admitted": None if line is None else line.as_data(), "note": "; ".join(notes), "withdrawn": attacker.attack in table.withdrawn,
         } | ({"shared": True} if attacker.attack in table.shared.difference(table.listed) else {}))  # fmt: skip

@@ -44,6 +44,7 @@ class Played(NamedTuple):
     ended: Array  # a collision
     gap: Array  # smallest gap of a car behind another [m]; inf where nobody drives
     error: Array  # largest error of an estimate
+    moved: Array  # distance of the car that comes least far [m]; inf where nobody drives
 
 
 class Decider(Protocol):
@@ -151,13 +152,17 @@ class Episodes:
         while done < self.horizon and not state.get_leaf("loop.ended").all():
             call.play(min(STEPS, self.horizon - done))
             done += STEPS
-        return Played(*(state.get_leaf(name) for name in ("loop.ended", "gap", "error")))
+        return Played(*(state.get_leaf(name) for name in ("loop.ended", "gap", "error", "moved")))
 
 
 def begun(loop: Loop, keys: Keys, memory: object) -> dict[str, Any]:
     """Return the state of episodes that begin."""
-    batch = len(keys.key)
-    return {"loop": loop.start(keys), "memory": memory, "gap": np.full(batch, np.inf), "error": np.zeros(batch)}
+    batch, state = len(keys.key), loop.start(keys)
+    first = loop.plant.scene(loop.plan.plant, state.plant).position
+    return {
+        "loop": state, "memory": memory, "gap": np.full(batch, np.inf), "error": np.zeros(batch),
+        "first": np.array(first, np.float64), "moved": np.full(batch, np.inf),
+    }  # fmt: skip
 
 
 def step(loop: Loop, attack: Decider, plan: object, held: Any) -> tuple[Any, Any]:
@@ -166,9 +171,11 @@ def step(loop: Loop, attack: Decider, plan: object, held: Any) -> tuple[Any, Any
     state, memory, frame = loop.step(held["loop"], cast("Attack", attack), plan, held["memory"])
     gap = np.min(np.where(loop.model.followers, frame.scene.gap, np.inf), axis=1)
     error = np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1)
+    moved = np.min(np.where(loop.model.followers, frame.scene.position - held["first"], np.inf), axis=1)
     gap = np.where(over, held["gap"], np.minimum(held["gap"], gap))
     error = np.where(over, held["error"], np.maximum(held["error"], error))
-    return {"loop": state, "memory": memory, "gap": gap, "error": error}, {}
+    moved = np.where(over, held["moved"], moved)
+    return {"loop": state, "memory": memory, "gap": gap, "error": error, "first": held["first"], "moved": moved}, {}
 
 
 def played_plainly(loop: Loop, attack: Decider, plan: object, keys: Keys, memory: object) -> Played:
@@ -178,7 +185,7 @@ def played_plainly(loop: Loop, attack: Decider, plan: object, keys: Keys, memory
         if held["loop"].ended.all():
             break
         held, _ = step(loop, attack, plan, held)
-    return Played(held["loop"].ended, held["gap"], held["error"])
+    return Played(held["loop"].ended, held["gap"], held["error"], held["moved"])
 
 
 _made: Remembered[Battery] = Remembered()

@@ -130,10 +130,10 @@ class Evolution:
 
     def generation(self, count: int) -> float:
         """Play a generation, each member on the same fresh episodes, and move; return the mean payment of its better half."""
-        episodes = self.episodes_of("train", self.episode, count)
+        episodes, reach = self.episodes_of("train", self.episode, count), self.arena.reach("train", self.episode, count)
         self.episode += count
         asked = [self.method.ask() for _ in range(self.method.population_size)]
-        paid = [float(np.mean(self.arena.payment(self.played(self.first + self.unit * z, episodes)))) for z in asked]
+        paid = [float(np.mean(self.arena.payment(self.played(self.first + self.unit * z, episodes), reach))) for z in asked]
         self.method.tell([(z, -one) for z, one in zip(asked, paid, strict=True)])
         self.mean = self.first + self.unit * self.method.mean
         return float(np.mean(sorted(paid)[len(paid) // 2 :]))
@@ -141,7 +141,8 @@ class Evolution:
     def judged(self) -> float:
         """Return the mean score of the mean policy on the episodes that judge all starts."""
         count = max(JUDGED // self.loop.model.agents, ROWS)
-        return float(np.mean(self.arena.score(self.played(self.mean, self.episodes_of("tune", FIRST, count)))))
+        played = self.played(self.mean, self.episodes_of("tune", FIRST, count))
+        return float(np.mean(self.arena.score(played, self.arena.reach("tune", FIRST, count))))
 
     def compare(self) -> None:
         """Keep the mean policy as champion if it does better than the one that is held."""

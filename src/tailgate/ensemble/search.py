@@ -80,6 +80,7 @@ class Arena:
     defence: str
     threat: dict[str, Any]
     bound: float | None  # error that counts as damage where nobody drives
+    progress: float | None = None  # share of its clean distance below which a car counts as damaged; None: never
 
     @cached_property
     def name(self) -> str:
@@ -118,8 +119,28 @@ class Arena:
         scene = self.loop.plant.scene(self.loop.plan.plant, self.loop.start(draws.keys("tune", range(FIRST))).plant)
         return float(np.mean(np.min(np.where(self.loop.model.followers, scene.gap, np.inf), axis=1)))
 
-    def harm(self, played: Played) -> tuple[Array, Array]:
+    @cached_property
+    def _reached(self) -> dict[tuple[str, int, int], Array]:
+        return {}
+
+    def reach(self, purpose: str, first: int, episodes: int) -> Array | None:
+        """Return the distances (episodes,) of the clean runs that episodes are judged by [m]; None where lost progress does not count."""
+        if self.progress is None or not self.loop.model.followers.any():
+            return None
+        at = purpose, first, episodes
+        if at not in self._reached:
+            none: Attack = Spec("attack", "none").make()
+            trace = rollout(self.loop, none, draws.keys(purpose, range(first, first + episodes)))
+            self._reached[at] = METRICS["distance_travelled"](trace)
+        return self._reached[at]
+
+    def harm(self, played: Played, reach: Array | None = None) -> tuple[Array, Array]:
         """Return damage (B,) bool, and how near (B,) each episode came to it, in [0, 1].
+
+        Parameters
+        ----------
+        reach
+            Distances (B,) of the clean runs, where lost progress counts (`reach`).
 
         Raises
         ------
@@ -127,16 +148,24 @@ class Arena:
             If nobody drives and no bound says which error is damage.
         """
         if self.loop.model.followers.any():
-            return played.ended, np.clip(1.0 - played.gap / self.start, 0.0, 1.0)
+            stalled, slowed = self._stalled(played, reach)
+            return played.ended | stalled, np.maximum(np.clip(1.0 - played.gap / self.start, 0.0, 1.0), slowed)
         if self.bound is None:
             raise InputError("suite: bound", None, f"an error that counts as damage: nobody drives in {self.scenario}")
         return played.ended | (played.error > self.bound), np.clip(played.error / self.bound, 0.0, 1.0)
+
+    def _stalled(self, played: Played, reach: Array | None) -> tuple[Array, Array]:
+        """Return if episodes (B,) lost too much progress, and how near (B,) each came to that, in [0, 1]."""
+        if reach is None or self.progress is None:
+            return np.zeros(len(played.gap), bool), np.zeros(len(played.gap))
+        lost = 1.0 - played.moved / np.maximum(reach, 1e-9)
+        return played.moved < self.progress * reach, np.clip(lost / (1.0 - self.progress), 0.0, 1.0)
 
     def scores(self, scripts: Sequence, first: int, episodes: int) -> Array:
         """Return the sum of scores (scripts,) of each script over the same episodes, from number `first` on."""
         loop, agents, total = self.loop, self.loop.model.agents, len(scripts.length)
         keys = draws.keys("tune", range(first, first + episodes))
-        each = max(AT_ONCE // (agents * episodes), 1)
+        each, reach = max(AT_ONCE // (agents * episodes), 1), self.reach("tune", first, episodes)
         attack = Scripts(len(scripts.phases) > 1)
         battery = battery_of(loop, attack, loop.brief, remembered(scripts.take(np.arange(ROWS) % total), agents))
         out = []
@@ -148,7 +177,8 @@ class Arena:
                 played = played_plainly(loop, attack, loop.brief, many, memory)
             else:
                 played = battery.play(many, memory)
-            out.append(self.score(played).reshape(len(some), episodes).sum(axis=1))
+            judged = self.score(played, None if reach is None else np.tile(reach, len(some)))
+            out.append(judged.reshape(len(some), episodes).sum(axis=1))
         return np.concatenate(out)
 
     def speed(self) -> float:
@@ -159,19 +189,19 @@ class Arena:
         self.scores(scripts, 0, FIRST)
         return ROWS * FIRST / (time.perf_counter() - begun)
 
-    def score(self, played: Played) -> Array:
+    def score(self, played: Played, reach: Array | None = None) -> Array:
         """Return the score (B,) of episodes: 1 for damage, and a little for coming near to it."""
-        damage, near = self.harm(played)
+        damage, near = self.harm(played, reach)
         return np.asarray(damage + GRADED * near)
 
-    def payment(self, played: Played) -> Array:
+    def payment(self, played: Played, reach: Array | None = None) -> Array:
         """Return what a learner is paid (B,) for episodes: its score, and more the nearer each came to damage.
 
         Damage alone says little of a small change of a policy; a gap that shrinks says it before there is a collision.
         """
-        damage, near = self.harm(played)
+        damage, near = self.harm(played, reach)
         if self.loop.model.followers.any():
-            near = np.exp(-np.maximum(played.gap, 0.0) / CLOSE)
+            near = np.maximum(np.exp(-np.maximum(played.gap, 0.0) / CLOSE), self._stalled(played, reach)[1])
         return np.asarray(damage + SHAPED * near)
 
     def confirmed(self, text: str, purpose: str, first: int, episodes: int) -> tuple[float, float]:
@@ -181,8 +211,9 @@ class Arena:
         loop = self.seat(spec.entry.knowledge, attack)
         trace = rollout(loop, attack, draws.keys(purpose, range(first, first + episodes)))
         gap = METRICS["min_gap"](trace) if loop.model.followers.any() else np.full(episodes, np.inf)
-        played = Played(METRICS["crashed"](trace) > 0, gap, METRICS["max_error"](trace))
-        return float(np.mean(self.harm(played)[0])), float(np.mean(self.score(played)))
+        played = Played(METRICS["crashed"](trace) > 0, gap, *(METRICS[name](trace) for name in ("max_error", "distance_travelled")))
+        reach = self.reach(purpose, first, episodes)
+        return float(np.mean(self.harm(played, reach)[0])), float(np.mean(self.score(played, reach)))
 
     def best(self, texts: Iterable[str]) -> list[Found]:
         """Return attacks after the last stage, on select episodes that they all meet, the most harmful first."""

@@ -27,6 +27,7 @@ from tailgate.ensemble.gradient import gradient_masking
 from tailgate.ensemble.members import BUDGETS, MEMBERS, Hunt, harvest
 from tailgate.ensemble.search import FINAL, Arena, Found
 from tailgate.evaluation.cells import Cell, run
+from tailgate.evaluation.rows import CLEAN
 from tailgate.evaluation.stats import proportion
 
 NAME = "standard-v0"
@@ -72,7 +73,7 @@ def jobs_of(suite: Suite, defence: str, scenarios: Sequence[str], doses: Sequenc
         if dose not in suite.doses:
             raise InputError("--dose", dose, f"one of the suite's: {', '.join(map(str, suite.doses))}")
     arenas = [
-        Arena(suite.name, scenario, dose, defence, dict(suite.granted), suite.bound)
+        Arena(suite.name, scenario, dose, defence, dict(suite.granted), suite.bound, suite.progress)
         for scenario in scenarios or suite.scenarios for dose in doses or suite.doses
     ]  # fmt: skip
     played, why = [], ""
@@ -97,7 +98,7 @@ def expected(jobs: Sequence[Job], workers: int) -> float:
     return steps / (arena.speed() * arena.loop.horizon) / min(workers, len(jobs))
 
 
-def searched(job: Job, folder: Path, tell: Callable[[int, int, str, float], None] | None = None) -> dict[str, Any]:
+def search(job: Job, folder: Path, tell: Callable[[int, int, str, float], None] | None = None) -> dict[str, Any]:
     """Run one search; return what every member found, and the best attack that the suite lists, on the same select episodes.
 
     folder: where files of attacks are written.
@@ -108,6 +109,46 @@ def searched(job: Job, folder: Path, tell: Callable[[int, int, str, float], None
         "scenario": arena.name, "place": arena.scenario, "dose": arena.dose, "listed": _strongest(arena, job.listed),
         "members": [one._asdict() | {"found": [found._asdict() for found in one.found[:SHOWN]]} for one in members],
     }  # fmt: skip
+
+
+def searched(
+    jobs: Sequence[Job], folder: Path, workers: int = 1, progress: Progress | None = None, announce: Callable[[float], None] | None = None
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Run searches, and return their results in order (`search`). Those that the folder has are not run again.
+
+    Parameters
+    ----------
+    folder
+        Its `searches` has the results, its `attacks` the files of programs and policies.
+    announce
+        Called with the seconds that the searches will take, about, before they begin.
+
+    Raises
+    ------
+    InputError
+        For a damaged result.
+    """
+    update = progress or (lambda *_: None)
+    done = {i: held for i, job in enumerate(jobs) if (held := _kept(job, folder)) is not None}
+    left = [i for i in range(len(jobs)) if i not in done]
+    if announce is not None and left:
+        announce(expected([jobs[i] for i in left], workers))
+    update("searches", len(done), len(jobs), "")
+
+    def finish(number: int, result: dict[str, Any]) -> None:
+        done[number] = result
+        write_atomic(_file(jobs[number], folder), json.dumps(result, indent=1).encode() + b"\n")
+        best = _best(result)
+        update("searches", len(done), len(jobs), f"{result['scenario']}: {best['damage']:.0%} by {best['attack']}" if best else "")
+
+    if workers > 1 and len(left) > 1:
+        for number, result in each(search, [(jobs[i], folder) for i in left], workers):
+            finish(left[number], result)
+    else:
+        for i in left:
+            label = f"{jobs[i].arena.scenario}, dose {jobs[i].arena.dose}"
+            finish(i, search(jobs[i], folder, lambda n, of, text, mean, label=label: update(label, n, of, text)))  # type: ignore[misc]
+    return [done[i] for i in range(len(jobs))]
 
 
 def _strongest(arena: Arena, attacks: Sequence[str]) -> dict[str, Any] | None:
@@ -163,38 +204,17 @@ def attack(
         raise InputError("--out", str(out), f"a path without any of {MARKS}: it stands in the texts of attacks")
     jobs = jobs_of(suite, defence, scenarios, doses, budget, seed)
     with contextlib.ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory())) if out is None else out
-        if out is not None:
-            stack.enter_context(alone(writable_directory(out, "--out")))
-        done = {i: held for i, job in enumerate(jobs) if (held := _kept(job, out)) is not None}
-        left = [i for i in range(len(jobs)) if i not in done]
-        if announce is not None and left:
-            announce(expected([jobs[i] for i in left], workers))
-        update("searches", len(done), len(jobs), "")
-
-        def finish(number: int, result: dict[str, Any]) -> None:
-            done[number] = result
-            if out is not None:
-                write_atomic(_file(jobs[number], out), json.dumps(result, indent=1).encode() + b"\n")
-            best = _best(result)
-            update("searches", len(done), len(jobs), f"{result['scenario']}: {best['damage']:.0%} by {best['attack']}" if best else "")
-
-        if workers > 1 and len(left) > 1:
-            for number, result in each(searched, [(jobs[i], folder) for i in left], workers):
-                finish(left[number], result)
-        else:
-            for i in left:
-                label = f"{jobs[i].arena.scenario}, dose {jobs[i].arena.dose}"
-                finish(i, searched(jobs[i], folder, lambda n, of, text, mean, label=label: update(label, n, of, text)))  # type: ignore[misc]
-        results = [done[i] for i in range(len(jobs))]
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory())) if out is None else writable_directory(out, "--out")
+        stack.enter_context(alone(folder))
+        results = searched(jobs, folder, workers, progress, announce)
         cells = [
             Cell(suite.name, one["place"], one["dose"], defence, text, episodes, threat=dict(suite.granted))
-            for one in results for text in dict.fromkeys(_chosen(one))
+            for one in results for text in dict.fromkeys([*_chosen(one), *([CLEAN] if suite.progress is not None else [])])
         ]  # fmt: skip
         rows = run(cells, out / "rows.jsonl" if out is not None else None, workers, lambda n, of: update("report", n, of, ""))
     report = {
         "ensemble": NAME, "suite": suite.name, "defence": defence, "budget": budget, "seed": seed, "episodes": episodes,
-        "cells": [_compared(result, rows, suite.bound) for result in results],
+        "cells": [_compared(result, rows, suite) for result in results],
     }  # fmt: skip
     if out is not None:
         write_atomic(out / "attack.json", json.dumps(report, indent=1).encode() + b"\n")
@@ -216,10 +236,10 @@ def _chosen(result: dict[str, Any]) -> list[str]:
     return listed + [one["found"][0]["attack"] for one in result["members"] if one["found"]]
 
 
-def _kept(job: Job, out: Path | None) -> dict[str, Any] | None:
+def _kept(job: Job, out: Path) -> dict[str, Any] | None:
     """Return the result of a search that an earlier run finished."""
-    path = None if out is None else _file(job, out)
-    if path is None or not path.is_file():
+    path = _file(job, out)
+    if not path.is_file():
         return None
     try:
         held = load_json(path)
@@ -235,16 +255,22 @@ def _kept(job: Job, out: Path | None) -> dict[str, Any] | None:
         raise InputError("--out", str(path), f"the result of a search; remove the file to search again ({said(error)})") from None
 
 
-def _compared(result: dict[str, Any], rows: list[dict[str, Any]], bound: float | None) -> dict[str, Any]:
+def _compared(result: dict[str, Any], rows: list[dict[str, Any]], suite: Suite) -> dict[str, Any]:
     """Return a line of the report: what each attack damaged on report episodes."""
+    mine = [row for row in rows if (row["scenario"], row["dose"], row["status"]) == (result["scenario"], result["dose"], "ok")]
+    reach = {row["seed"]: row["distance_travelled"] for row in mine if row["attack"] == CLEAN}
+
+    def hit(row: dict[str, Any]) -> bool:
+        stalled = suite.progress is not None and row["distance_travelled"] is not None and (
+            row["distance_travelled"] < suite.progress * reach[row["seed"]]
+        )
+        return bool(row["crashed"]) or stalled or (suite.bound is not None and row["max_error"] > suite.bound)
 
     def damage(text: str | None) -> dict[str, Any] | None:
-        own = [r for r in rows if (r["scenario"], r["dose"], r["attack"]) == (result["scenario"], result["dose"], text)] if text else []
-        own = [row for row in own if row["status"] == "ok"]
+        own = [row for row in mine if row["attack"] == text]
         if not own:
             return None
-        hits = sum(bool(row["crashed"]) or (bound is not None and row["max_error"] > bound) for row in own)
-        share = proportion(hits, len(own))
+        share = proportion(sum(map(hit, own)), len(own))
         return {"attack": text, "damage": share.value, "low": share.low, "high": share.high, "episodes": len(own)}
 
     members = [

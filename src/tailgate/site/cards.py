@@ -18,6 +18,7 @@ from tailgate.core.registry import Family, built_in
 from tailgate.core.scenario import Suite as Played
 from tailgate.core.scenario import list_suites, load_scenario, load_suite
 from tailgate.core.threat import ThreatModel
+from tailgate.training.adaptive import plan_of
 
 from .suite import Suite
 
@@ -88,9 +89,11 @@ def _training(family: Family, name: Name, suite: Played | None) -> str:
         return "none"
     if suite is None or not suite.adaptive:
         return "as the file of the policy says"
-    plan = suite.adaptive
-    learners = "; ".join(f"{learner} ({', '.join(changes)})" for learner, changes in plan["learners"].items())
-    return f"against one defence each, preset {plan['config']}, {plan.get('seeds', 5)} seeds: {learners}"
+    plan = plan_of(suite)
+    if not plan.learners:
+        return f"against one defence, by the standard attack ensemble, budget {plan.ensemble}"
+    learners = "; ".join(f"{learner} ({', '.join(changes)})" for learner, changes in plan.learners.items())
+    return f"against one defence each, preset {plan.config}, {plan.seeds} seeds: {learners}"
 
 
 def own_card(suite: Suite, family: Family, name: Name) -> Data:

@@ -1,8 +1,9 @@
-"""Attackers trained against one defence, as a suite says: a board ranks a defence after it has met them.
+"""Attackers made against one defence, as a suite says: a board ranks a defence after it has met them.
 
 An attack that was made for another defence says little: most published defences fell to the first attack that knew them. (Tramèr et al.,
 On Adaptive Attacks to Adversarial Example Defenses, NeurIPS 2020.) So every learner that the suite names is trained on the defence itself.
-It has the suite's dose and threat model, black and grey box. Its policies join the attacks of that defence's rows.
+It has the suite's dose and threat model, black and grey box. Its policies join the attacks of that defence's rows. A suite may ask for the
+standard attack ensemble instead (`tailgate.board.searched`).
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from tailgate.envs.gym.observations import ObservationCodec
 from tailgate.training import train
 
 Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
+SIZES = ("quick", "standard")  # budgets of the standard attack ensemble
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,12 @@ class Adaptive:
     learners: dict[str, tuple[str, ...]] = field(default_factory=dict, metadata={"doc": "learners, each with its own changes"})
     knowledge: tuple[str, ...] = param(("black", "grey"), "what the attackers know, one training each")
     seeds: Seeds = param(5, "training seeds of each")
+    ensemble: str = param("", f"budget of the standard attack ensemble, {' or '.join(SIZES)}; empty: it is not asked for")
+    doses: tuple[int, ...] = param((), "the suite's doses that the ensemble searches at; none: those that are shown, or all numbers")
+
+    def searched(self, suite: Suite) -> tuple[int | None, ...]:
+        """Return the doses that the ensemble searches at."""
+        return self.doses or tuple(dose for dose in suite.doses if dose in suite.shown) or suite.doses
 
 
 def plan_of(suite: Suite) -> Adaptive:
@@ -56,8 +64,13 @@ def plan_of(suite: Suite) -> Adaptive:
     for name in plan.knowledge:
         if name not in KNOWLEDGE:
             raise unknown(f"{where}.knowledge", name, KNOWLEDGE)
-    if not plan.learners:
-        raise InputError(f"{where}.learners", {}, "at least one learner")
+    if not (plan.learners or plan.ensemble):
+        raise InputError(f"{where}.learners", {}, "at least one learner, or an ensemble")
+    if plan.ensemble not in ("", *SIZES):
+        raise unknown(f"{where}.ensemble", plan.ensemble, SIZES)
+    for dose in plan.doses:
+        if dose not in suite.doses:
+            raise InputError(f"{where}.doses", dose, f"one of the suite's doses {list(suite.doses)}")
     for name in plan.scenarios:
         if name not in suite.scenarios:
             raise unknown(f"{where}.scenarios", name, suite.scenarios)

@@ -1,0 +1,172 @@
+"""The standard ensemble on boards: what it finds is played, asked for before a rank, held by the board, and counted by member."""
+
+import argparse
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tailgate.base.errors import InputError
+from tailgate.board import searched
+from tailgate.board.check import SCORED
+from tailgate.board.damage import damaged, reach_of
+from tailgate.board.files import read_board
+from tailgate.board.run import board_of, files_of_rows
+from tailgate.board.score import score
+from tailgate.cli import board as command
+from tailgate.core.scenario import load_suite
+from tailgate.ensemble import standard
+from tailgate.ensemble.battery import Played
+from tailgate.ensemble.search import Arena
+from tailgate.evaluation.cells import Cell, run
+from tailgate.evaluation.rows import read_rows
+from tailgate.training.adaptive import SIZES, plan_of
+
+TEXT = """about: s
+progress: 0.5
+measures: true
+scenarios: [radar-braking-v0]
+doses: [4, 9]
+defences: [none, chi2_kf, stand_still]
+attacks: [none, 'noise_jam:start_step=10']
+seeds: 8
+threat: {delay_bound: 60.0}
+adaptive: {ensemble: quick, doses: [4]}
+"""
+
+
+def _run(*arguments: str) -> None:
+    parser = argparse.ArgumentParser()
+    command.add(parser.add_subparsers())
+    options = parser.parse_args(["run", *arguments, "--no-replays", "--workers", "1"])
+    assert options.run(options) == 0
+
+
+@pytest.fixture
+def made(small_ensemble: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+    """A suite's file, and the folder of its board, relative to the working directory."""
+    monkeypatch.chdir(tmp_path)
+    file = Path("small-v1.yaml")
+    file.write_text(TEXT)
+    _run(str(file), "--out", "out", "--train")
+    return file, Path("out/small-v1")
+
+
+def test_one_command_searches_before_it_ranks(made: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who passes the gates is attacked at the plan's dose; what was found is played at all doses, and once more nothing is."""
+    file, folder = made
+    data = json.loads((folder / "board.json").read_text())
+    assert {e["defence"]: e["status"] for e in data["entries"]} == {"none": "unranked", "chi2_kf": "ranked", "stand_still": "unranked"}
+    (line,) = data["searches"]
+    (cell,) = line["cells"]
+    assert (line["defence"], line["budget"], cell["dose"]) == ("chi2_kf", "quick", 4)
+    assert [one["member"] for one in cell["members"]] == [one.name for one in standard.MEMBERS]
+    found = [one["attack"] for one in cell["members"] if one["attack"]]
+    best = {one["member"]: one["damage"] for one in cell["members"] if one["damage"] is not None}
+    assert max(best.values()) == next(best[one["member"]] for one in cell["members"] if one["attack"])
+    for attack in found:
+        mine = [c for c in data["cells"] if c["attack"] == attack]
+        assert {(c["defence"], c["dose"]) for c in mine} >= {("chi2_kf", 4), ("chi2_kf", 9)} and all(c["n"] == 8 for c in mine)
+    trained = {a["attack"]: a["trained_on"] for a in data["attacks"]}
+    assert trained == {"noise_jam:start_step=10": None} | dict.fromkeys(found, "chi2_kf")
+    in_files = [Path(attack.partition("path=")[2]) for attack in found if "path=" in attack]
+    assert in_files and all(path.is_file() and path.parent == folder / "attacked" / "found" for path in in_files)
+    before = {path: path.read_bytes() for path in Path("out").glob("**/*") if path.is_file()}
+    monkeypatch.setattr(standard, "search", lambda *_: pytest.fail("searched again"))
+    _run(str(file), "--out", "out", "--train")
+    assert {path: path.read_bytes() for path in Path("out").glob("**/*") if path.is_file()} == before
+
+
+def test_a_rank_asks_for_the_searches(made: tuple[Path, Path]) -> None:
+    """Each lack has its reason; a board holds what its statuses need, and entries that stay keep their searches."""
+    file, folder = made
+    suite, data = load_suite(str(file)), json.loads((folder / "board.json").read_text())
+    rows = [row for path in files_of_rows(folder) for row in read_rows(path)]
+    again = score(rows, suite, searches=data["searches"])
+    assert [[e[k] for k in SCORED] for e in again["entries"]] == [[e[k] for k in SCORED] for e in data["entries"]]
+    (line,) = data["searches"]
+    attack = next(one["attack"] for one in line["cells"][0]["members"] if one["attack"])
+
+    def why(searches: list[dict[str, object]], some: list[dict[str, object]] = rows) -> str:
+        (entry,) = (e for e in score(some, suite, searches=searches)["entries"] if e["defence"] == "chi2_kf")
+        assert entry["status"] == "unattacked" and entry["rank"] is None
+        return str(entry["why"])
+
+    assert why([]) == "the standard ensemble (budget quick) has not attacked this defence"
+    assert why([line | {"budget": "standard"}]) == "the ensemble attacked another budget: standard, not quick"
+    assert why([line | {"digest": "abc"}]) == "the ensemble attacked another digest: abc, not none"
+    assert why([line | {"cells": []}]) == "the ensemble has not attacked it on radar-braking-v0 at dose 4"
+    assert why([line], [row for row in rows if row["attack"] != attack]) == f"what the ensemble found was not played on radar-braking-v0: {attack}"
+    assert score([r for r in rows if r["defence"] != "chi2_kf"], suite, board=data)["searches"] == data["searches"]
+    read_board(data)
+    (folder / "attacked" / "chi2_kf.search.json").write_text(json.dumps(line | {"cells": 3}))
+    with pytest.raises(InputError, match=r"chi2_kf\.search\.json: cells.*list"):
+        board_of(suite, folder)
+    line["cells"][0]["members"][0]["attack"] = "evil_attack:Evil"
+    (folder / "attacked" / "chi2_kf.search.json").write_text(json.dumps(line))
+    with pytest.raises(InputError, match="evil_attack"):
+        board_of(suite, folder)
+
+
+@pytest.mark.parametrize(
+    ("plan", "words"),
+    [
+        ("{ensemble: huge}", "ensemble: got 'huge'"), ("{ensemble: quick, doses: [5]}", r"doses: got 5; expected one of the suite's doses \[4, 9\]"),
+        ("{config: radar}", "at least one learner, or an ensemble"),
+    ],
+)  # fmt: skip
+def test_plans_that_cannot_be_kept_are_refused(plan: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / "s.yaml").write_text(TEXT.replace("{ensemble: quick, doses: [4]}", plan))
+    with pytest.raises(InputError, match=words):
+        load_suite(str(tmp_path / "s.yaml"))
+
+
+def test_plans_name_budgets_that_there_are() -> None:
+    assert set(SIZES) == set(standard.BUDGETS)
+    suite = load_suite("radar-v1")
+    assert plan_of(suite).searched(suite) == (2, 4, 9)
+
+
+@pytest.mark.parametrize("defence", ["brake_kf", "always_brake"])
+def test_a_search_counts_lost_progress_as_a_board_does(defence: str) -> None:
+    """A car that is made to stand still is damaged in the search that is to find such attacks; without the suite's share it is not."""
+    suite = dataclasses.replace(load_suite("quick-v1"), name="test", seeds=32)
+    place, dose, attack = "gusty-stop-and-go-v0", 12, "dos_jam:trigger=near,threshold=40"
+    arena = Arena("test", place, dose, defence, dict(suite.granted), suite.bound, suite.progress)
+    cells = [Cell("test", place, dose, defence, text, 32, "select", threat=suite.granted) for text in ("none", attack)]
+    rows = run(cells)
+    reach = reach_of(rows[:32])
+    share = float(np.mean([damaged(row, suite, reach) for row in rows[32:]]))
+    assert arena.confirmed(attack, "select", 0, 32)[0] == share
+    crashes = float(np.mean([row["crashed"] for row in rows[32:]]))
+    assert dataclasses.replace(arena, progress=None).confirmed(attack, "select", 0, 32)[0] == crashes
+
+
+def test_lost_progress_raises_the_score_before_it_is_damage() -> None:
+    """An episode that is slowed more scores more; half of the clean distance is the suite's limit."""
+    arena = Arena("test", "gusty-stop-and-go-v0", 12, "kf", dict(load_suite("quick-v1").granted), None, 0.5)
+    moved, far = np.array([100.0, 80.0, 51.0, 49.0]), np.full(4, 100.0)
+    played = Played(np.zeros(4, bool), np.full(4, 1e3), np.zeros(4), moved)
+    damage, near = arena.harm(played, far)
+    assert damage.tolist() == [False, False, False, True] and near.tolist() == pytest.approx([0.0, 0.4, 0.98, 1.0])
+    assert arena.harm(played)[0].tolist() == [False] * 4
+    assert np.all(np.diff(arena.payment(played, far)) > 0.0)
+
+
+def test_what_each_member_adds() -> None:
+    """A member is compared with the list and with those that know as much or less."""
+
+    def cell(listed: float, **damage: float) -> dict[str, object]:
+        known = {"scripts": "black", "networks": "black", "white": "white"}
+        return {
+            "scenario": "s", "dose": 1, "listed": listed,
+            "members": [{"member": m, "knowledge": known[m], "why": "", "damage": x, "attack": None} for m, x in damage.items()],
+        }  # fmt: skip
+
+    line = {"cells": [cell(0.2, scripts=0.5, networks=0.4, white=0.9), cell(0.3, scripts=0.3, networks=0.7), cell(0.8, scripts=0.5, white=0.6)]}
+    scripts, networks, white = searched.worth([line])
+    assert (scripts["cells"], scripts["alone"]) == (3, 1) and scripts["adds"] == pytest.approx(0.1 / 3)
+    assert (networks["cells"], networks["alone"]) == (2, 1) and networks["adds"] == pytest.approx(0.2)
+    assert (white["cells"], white["alone"]) == (2, 1) and white["adds"] == pytest.approx(0.2) and white["damage"] == pytest.approx(0.75)
