@@ -73,6 +73,9 @@ def test_one_command_searches_before_it_ranks(made: tuple[Path, Path], monkeypat
     assert trained == {"noise_jam:start_step=10": None} | dict.fromkeys(found, "chi2_kf")
     in_files = [Path(attack.partition("path=")[2]) for attack in found if "path=" in attack]
     assert in_files and all(path.is_file() and path.parent == folder / "attacked" / "found" for path in in_files)
+    page = Path("out/page/index.html").read_text()
+    assert "Attacks that were searched" in page and f"was played: {len(found)} attacks" in page
+    assert all(f"<th scope=\"row\">{member.name}</th>" in page for member in standard.MEMBERS)
     before = {path: path.read_bytes() for path in Path("out").glob("**/*") if path.is_file()}
     monkeypatch.setattr(standard, "search", lambda *_: pytest.fail("searched again"))
     _run(str(file), "--out", "out", "--train")

@@ -108,7 +108,7 @@ def test_attackers_that_only_their_own_defence_met_share_a_column(tmp_path):
                 board["cells"].append(c | part | {"damage": boards.share(20 + 60 * i + 30 * j)})
     page = Outline(build_site([board], tmp_path, replays=False).read_text(encoding="utf-8"))
     heads, *rows = page.rows("heat map")
-    assert heads.count("trained against it the worst") == 1 and "p-0" not in heads and "policy" in heads
+    assert heads.count("made against it the worst") == 1 and "p-0" not in heads and "policy" in heads
     first = {r.split()[0]: re.findall(r"(\d+%|n/a) ,", r)[1] for r in rows if " ," in r}
     assert first["kf"] == "25%" and first["chi2_kf"] == "40%" and first["cusum_kf"] == "n/a"
     lines = [row for row in page.rows("cells ranks") if row.startswith("Not attacked yet")]

@@ -12,6 +12,8 @@ from markupsafe import Markup, escape
 
 from tailgate.core.spec_text import split_text
 
+SUFFIXES = (".json", ".yaml", ".yml")  # of policies and programs
+
 
 @dataclass(frozen=True)
 class Name:
@@ -28,17 +30,20 @@ class Name:
 
 
 def names_of(texts: Iterable[str]) -> dict[str, Name]:
-    """Return the name of each text. Policies go by as many folders of their path as tell them apart."""
+    """Return the name of each text. Policies and programs go by as many folders of their path as tell them apart."""
     split = {text: _split(text) for text in texts}
-    paths = {text: tuple(p for p in re.split(r"[\\/]", head.removesuffix(".json")) if p) for text, (head, _) in split.items()}
+    paths = {
+        text: tuple(p for p in re.split(r"[\\/]", head.rpartition(".")[0]) if p) for text, (head, _) in split.items()
+        if head.endswith(SUFFIXES)
+    }  # fmt: skip
     out = {}
     for text, (head, params) in split.items():
-        if head.endswith(".json"):
-            others = {paths[t] for t, (h, _) in split.items() if h.endswith(".json")} - {paths[text]}
-            depth = 2
+        if text in paths and (head.endswith(".json") or len(paths[text]) > 1):
+            others, depth = {*paths.values()} - {paths[text]}, 2
             while depth < len(paths[text]) and any(p[-depth:] == paths[text][-depth:] for p in others):
                 depth += 1
-            out[text] = Name("/".join(paths[text][-depth:]), params, "policy", True)
+            policy = head.endswith(".json")
+            out[text] = Name("/".join(paths[text][-depth:]), params, "policy" if policy else head, policy)
         elif head == "zoo":
             name = next((p.removeprefix("name=") for p in params if p.startswith("name=")), "zoo")
             out[text] = Name(name, tuple(p for p in params if not p.startswith("name=")), "zoo", True)
@@ -55,7 +60,7 @@ def _split(text: str) -> tuple[str, tuple[str, ...]]:
     if not tail or text.endswith(")"):
         return text, ()
     params = tuple(re.split(r",\s*(?=\w+=)", tail))
-    path = next((p for p in params if head == "policy" and p.startswith("path=")), None)
+    path = next((p for p in params if head in ("policy", "program") and p.startswith("path=") and p.endswith(SUFFIXES)), None)
     return (head, params) if path is None else (path.removeprefix("path="), tuple(p for p in params if p != path))
 
 

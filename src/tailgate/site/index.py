@@ -13,12 +13,13 @@ from tailgate.training import adaptive
 from . import alarms, measures
 from .cards import attack_cards, suite_of
 from .curves import curves_of, stealth_of, together_of
+from .searched import found_for, members_of
 from .suite import Suite, cell_of, critical_of, dose_text, figure, gates_of, played, share_of, worse
 from .timing import flags_of
 from .trust import trust_cell, trust_of
 
 OWN = ""  # in place of an attack: all that were trained against the row's defence
-TRAINED = Name("trained against it", ("the worst",))
+TRAINED = Name("made against it", ("the worst",))
 
 
 def _lines(suite: Suite, measured: Attachments) -> list[Data]:
@@ -222,7 +223,8 @@ def ranked_against(suite: Suite) -> str:
 def attacks_of(suite: Suite) -> list[Data]:
     """Return the lines of a board's attacks, for the table of the first page."""
     own, out = suite_of(suite.board.suite.name, suite.board.suite.hash), []
-    for attack in suite.board.attacks:
+    apart = found_for(suite).keys() - set(own.attacks if own else ())  # they have a table for themselves
+    for attack in (one for one in suite.board.attacks if one.attack not in apart):
         late = own is not None and attack.attack not in own.attacks and not attack.attack.endswith(".json")
         admitted = "met later, outside the suite" if late else "with the suite"
         admitted = admitted if attack.admitted is None else _admitted(attack.admitted)
@@ -283,6 +285,7 @@ def section(suite: Suite, measured: Attachments) -> Data:
         "statuses": [s for s, *_ in GROUPS if any(r["status"] == s for r in rows)], "levels": LEVELS,
         "heat": heat_of(suite), "scale": suite.scale, "together": together_of(suite), "curves": curves_of(suite),
         "stealth": stealth_of(suite), "detection": detection_of(suite), "comparisons": comparisons_of(suite), "attacks": attacks_of(suite),
+        "members": members_of(suite),
         "how": compared_how(suite), "attack_cards": attack_cards(suite), "errata": measured.superseded(),
         "ranked_against": ranked_against(suite),
         "run": measured.run.said(board.suite.rows) if measured.run is not None and board.suite.rows is not None else "",
