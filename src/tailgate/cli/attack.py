@@ -1,4 +1,4 @@
-"""tailgate leaderboard attack: train a suite's attackers against a defence, and play them on it."""
+"""tailgate leaderboard attack: make a suite's attackers against a defence, and play them on it."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from tailgate.cli.shared import Commands, own_classes, working
 def add(actions: Commands) -> None:
     """Add `attack` to the actions of a command."""
     command = actions.add_parser(
-        "attack", help="train a suite's attackers against a defence, and play them on it",
-        description="Train the learners that the suite names against the defence itself, black and grey box, and play their policies at "
-        "every dose and scenario. A defence without these rows takes no rank. Interrupted, the same command goes on.",
+        "attack", help="make a suite's attackers against a defence, and play them on it",
+        description="Run the standard attack ensemble against the defence, or train the learners that the suite names, as its plan says. "
+        "What they make is played on the defence at every dose. A defence without these rows takes no rank. Interrupted, the same command "
+        "goes on.",
     )  # fmt: skip
     command.add_argument("defence", metavar="NAME", help="registered defence, or a class in a sandbox: bwrap/module:Class")
-    command.add_argument("--suite", required=True, metavar="NAME", help="suite that says what is trained")
-    command.add_argument("--out", required=True, metavar="DIR", help="policies go to DIR/policies, rows to DIR/NAME*.jsonl")
+    command.add_argument("--suite", required=True, metavar="NAME", help="suite that says what is searched or trained")
+    command.add_argument("--out", required=True, metavar="DIR", help="attackers go to DIR/policies or DIR/found, rows to DIR/NAME*.jsonl")
     command.add_argument("--seeds", type=int, metavar="N", help="training seeds instead of the suite's")
     command.add_argument("--episodes", type=int, metavar="N", help="report episodes per cell instead of the suite's")
     command.add_argument("--beacon", default="", metavar="TEXT", help="the round of the board: its seeds are played")
@@ -44,5 +45,5 @@ def _attack(options: argparse.Namespace) -> int:
         )  # fmt: skip
     for file in made.files:
         print(file)
-    print(f"{len(made.policies)} policies, {made.rows} rows", file=sys.stderr)
+    print(f"{len(made.policies)} trained policies, {made.rows} rows", file=sys.stderr)
     return 0

@@ -38,7 +38,7 @@ def add(actions: Commands) -> None:
                          help="entries of OUT/SUITE/board.json stay that have no rows here, or not those of all their cells; "
                          "they may meet more attacks")  # fmt: skip
     command.add_argument("--train", action="store_true",
-                         help="then train the suite's attackers against every defence that passes the gates, and play them")  # fmt: skip
+                         help="then make the suite's attackers against every defence that passes the gates, and play them")  # fmt: skip
     command.add_argument("--detection", action="store_true", help="then play detection as `leaderboard detect` does: slow")
     command.add_argument("--unattacked", action="store_true", help="also rank defences that no attack was trained against")
     add_options(command, "--no-replays")

@@ -1,0 +1,157 @@
+"""Learned attacks against searched scripts: the standard ensemble in every cell of record.yaml, with five seeds.
+
+    python results/adversaries-v1/record.py [--seeds 5] [--episodes 2000] [--workers 2] [--out runs/record]
+
+In each cell every seed searches anew: scripts, programs and networks, black box. Each seed's best network meets the best script or
+program of all seeds, chosen on select episodes, on fresh report episodes. The champion is the network of all seeds that did best on
+select episodes. A test is McNemar's on the same episodes, one-sided, corrected by Holm over all tests of the record. The same command
+goes on after an interrupt. Writes report.json and report.md next to this file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from tailgate.base.errors import NotApplicable
+from tailgate.base.files import write_atomic
+from tailgate.base.locks import alone
+from tailgate.base.pool import each
+from tailgate.base.progress import progress
+from tailgate.core import Array, draws
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_suite
+from tailgate.core.schema import read_yaml
+from tailgate.ensemble.battery import Played
+from tailgate.ensemble.members import BUDGETS, Hunt, harvest
+from tailgate.ensemble.search import Arena
+from tailgate.ensemble.standard import Job
+from tailgate.evaluation.stats import holm, proportion
+from tailgate.play.metrics import METRICS
+from tailgate.play.trace import rollout
+
+HERE = Path(__file__).parent
+FIRST = 20261128  # of the report episodes: no search and no suite has met them
+SCRIPTS, LEARNED = ("scripts", "programs"), "networks"
+LEVEL = 0.05
+
+
+def searched(job: Job, folder: Path) -> dict[str, Any]:
+    """Search once; return the best script or program, the best network, and the processor time."""
+    begun = time.process_time()
+    hunt = Hunt(job.arena, BUDGETS[job.budget], job.seed, folder / "attacks" / job.name, only=(*SCRIPTS, LEARNED))
+    found = {one.member: one.found[0]._asdict() for one in harvest(hunt) if one.found}
+    script = max((found[name] for name in SCRIPTS if name in found), key=lambda one: one["score"])
+    return {"script": script, "learned": found.get(LEARNED), "seconds": time.process_time() - begun}
+
+
+def hits(arena: Arena, text: str, episodes: int) -> Array:
+    """Return which report episodes (episodes,) an attack damages."""
+    spec = Spec("attack", text)
+    attack = spec.make()
+    loop = arena.seat(spec.entry.knowledge, attack)
+    trace = rollout(loop, attack, draws.keys("report", range(FIRST, FIRST + episodes)))
+    played = Played(METRICS["crashed"](trace) > 0, *(METRICS[name](trace) for name in ("min_gap", "max_error", "distance_travelled")))
+    return arena.harm(played, arena.reach("report", FIRST, episodes))[0]
+
+
+def more(a: Array, b: Array) -> float:
+    """Return p of the null hypothesis that a damages no more than b: McNemar's exact test, one-sided."""
+    from scipy.stats import binomtest
+
+    only_a, only_b = int(np.sum(a & ~b)), int(np.sum(b & ~a))
+    return float(binomtest(only_a, only_a + only_b, alternative="greater").pvalue) if only_a + only_b else 1.0
+
+
+def compared(arena: Arena, runs: list[dict[str, Any]], episodes: int) -> dict[str, Any]:
+    """Return a cell's line: the best script of all seeds, and each seed's network against it."""
+    script = max((run["script"] for run in runs), key=lambda one: one["score"])
+    base, out = hits(arena, script["attack"], episodes), []
+    for run in runs:
+        held = run["learned"]
+        mine = hits(arena, held["attack"], episodes) if held else np.zeros(episodes, bool)
+        out.append({"share": float(mine.mean()), "score": held["score"] if held else 0.0, "p": more(mine, base), "less": more(base, mine)})
+    share = proportion(int(base.sum()), episodes)
+    return {
+        "scenario": arena.name, "dose": arena.dose, "defence": arena.defence, "script": script["attack"],
+        "seconds": sum(run["seconds"] for run in runs),
+        "scripts": {"share": share.value, "low": share.low, "high": share.high}, "seeds": out,
+        "champion": max(range(len(out)), key=lambda i: out[i]["score"]),
+    }  # fmt: skip
+
+
+def verdicts(cells: list[dict[str, Any]]) -> None:
+    """Add to each seed of each cell if it wins, loses, or neither, corrected over all tests in both directions."""
+    tests = [(seed, side) for cell in cells for seed in cell["seeds"] for side in ("p", "less")]
+    for (seed, side), p in zip(tests, holm([seed[side] for seed, side in tests]), strict=True):
+        seed[f"adjusted_{side}"] = p
+    for cell in cells:
+        for seed in cell["seeds"]:
+            seed["verdict"] = "wins" if seed["adjusted_p"] < LEVEL else "loses" if seed["adjusted_less"] < LEVEL else "undecided"
+
+
+def markdown(cells: list[dict[str, Any]], options: argparse.Namespace) -> str:
+    """Return the report as a page."""
+    lines = [
+        "# Learned attacks against searched scripts", "",
+        f"`python results/adversaries-v1/record.py --seeds {options.seeds} --episodes {options.episodes}`: budget quick of the standard",
+        f"ensemble, black box, {options.episodes} fresh episodes a cell; 95 % intervals.",
+        "The script is the best script or program of all seeds.",
+        "", "| scenario, defence, dose | best script | learned, each seed | champion | seeds that win / lose | minutes of processor time |",
+        "|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for cell in cells:
+        said, best = [seed["verdict"] for seed in cell["seeds"]], cell["seeds"][cell["champion"]]
+        share, low, high = (100 * cell["scripts"][name] for name in ("share", "low", "high"))
+        lines.append("| " + " | ".join([
+            f"`{cell['scenario']}`, `{cell['defence']}`, {cell['dose']}", f"{share:.1f} % ({low:.1f} to {high:.1f})",
+            ", ".join(f"{100 * seed['share']:.1f}" for seed in cell["seeds"]), f"{100 * best['share']:.1f}, {best['verdict']}",
+            f"{said.count('wins')} / {said.count('loses')} of {len(said)}", f"{cell['seconds'] / 60:.1f}",
+        ]) + " |")  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Search, compare and write the report."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=5, help="seeds of the search (default 5)")
+    parser.add_argument("--episodes", type=int, default=2000, help="report episodes (default 2000)")
+    parser.add_argument("--workers", type=int, default=2, help="processes (default 2); change no result")
+    parser.add_argument("--out", type=Path, default=Path("runs/record"), help="finished searches; the same command goes on")
+    options = parser.parse_args()
+    jobs: list[Job] = []
+    for name, cells in read_yaml(HERE / "record.yaml", "record")["suites"].items():
+        suite = load_suite(name)
+        for scenario, dose, defence in cells:
+            arena = Arena(name, scenario, dose, defence, dict(suite.granted), suite.bound, suite.progress)
+            jobs += [Job(arena, "quick", seed, ()) for seed in range(options.seeds)]
+    options.out.mkdir(parents=True, exist_ok=True)
+    with alone(options.out), progress(Console(stderr=True)) as update:
+        files = [options.out / f"{job.name}.json" for job in jobs]
+        left = [i for i, file in enumerate(files) if not file.is_file()]
+        for done, (number, result) in enumerate(each(searched, [(jobs[i], options.out) for i in left], options.workers)):
+            write_atomic(files[left[number]], json.dumps(result, indent=1).encode() + b"\n")
+            job = jobs[left[number]]
+            update("record", done + 1, len(left), f"{job.arena.scenario}, {job.arena.defence}, seed {job.seed}")
+        out = []
+        for i in range(0, len(jobs), options.seeds):
+            runs = [json.loads(file.read_text()) for file in files[i : i + options.seeds]]
+            try:
+                out.append(compared(jobs[i].arena, runs, options.episodes))
+            except NotApplicable as error:
+                print(f"{jobs[i].arena.defence}: {error}")
+    verdicts(out)
+    write_atomic(HERE / "report.json", json.dumps(out, indent=1).encode() + b"\n")
+    page = markdown(out, options)
+    write_atomic(HERE / "report.md", page.encode())
+    print(page)
+
+
+if __name__ == "__main__":
+    main()
