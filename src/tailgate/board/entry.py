@@ -50,8 +50,8 @@ def entry_of(
 ) -> Data:  # fmt: skip
     """Return the entry of a defence that is made of rows: status, gates, flags, worst episode and figures.
 
-    origins: how each learned attack was trained; trained: the defence that an attack was made against; asked: the suite's trainings, None
-    where a rank asks for no attack that was made against the defence; searches: what the standard ensemble found.
+    origins: how each learned attack was trained. trained: the defence that an attack was made against. asked: the suite's trainings; None
+    where a rank asks for no attack of this kind. searches: the results of the standard ensemble.
     """
     rows = [row for key in sorted(table.cells) if key.defence == defence for row in table.cells[key]]
     uses = [str(use) for use in rows[0]["uses"]]

@@ -4,25 +4,20 @@
 shows.
 """
 
+# ruff: noqa: RUF012  (pydantic copies defaults)
+
 from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from .part import LEVELS, Count, Data, Dose, Level, Number, Part, Share, Text
+from .search_results import SearchedLine
+
+__all__ = ["LEVELS", "Count", "Data", "Dose", "Level", "Number", "Part", "Share", "Text"]  # nouns of all formats, for those who read boards
 
 FORMAT: Literal["tailgate-board-1"] = "tailgate-board-1"
-Level = Literal["black", "grey", "white"]
-LEVELS: tuple[Level, ...] = ("black", "grey", "white")  # what an attacker knows, from the least
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Share = Annotated[float, Field(strict=True, ge=0.0, le=1.0)]
-Text = Annotated[str, Field(strict=True)]
-Count = Annotated[int, Field(strict=True, ge=0)]
-Dose = Count | None  # None: the scenario's own budget
-Data = dict[str, Any]  # JSON data of a board, or of a part of it
-
-
-class Part(BaseModel):
-    model_config = ConfigDict(extra="allow", strict=True)
 
 
 class ScenarioLine(Part):
@@ -368,34 +363,6 @@ class Trust(Part):
     unsafe: dict[str, Number] = {}
     demands: dict[str, Number] = {}
     properties: list[TrustProperty] = []
-
-
-class SearchedMember(Part):
-    """What a member of the ensemble found in a cell: damage on select episodes; the attack where it is played."""
-
-    member: Text
-    knowledge: Level
-    why: Text = ""  # why it found nothing
-    damage: Share | None
-    attack: Text | None
-
-
-class SearchedCell(Part):
-    scenario: Text
-    dose: Dose
-    listed: Share | None  # damage of the suite's best attack, on the same episodes
-    members: list[SearchedMember]
-
-
-class SearchedLine(Part):
-    """What the standard attack ensemble found against a defence."""
-
-    defence: Text
-    digest: Text
-    version: Count
-    ensemble: Text
-    budget: Text
-    cells: list[SearchedCell]
 
 
 class Board(Part):

@@ -1,4 +1,4 @@
-"""What the standard attack ensemble found against a defence, as a board asks for it before it ranks.
+"""Attacks that the standard ensemble finds against a defence: a board asks for them before it ranks.
 
 The suite's plan names a budget. Every scenario is searched, at the plan's doses. Of each search the best attack of every class of knowledge
 is played, in that scenario at all doses. The results lie with the rows, and the board holds them, so that it can be scored without them.
@@ -27,7 +27,8 @@ from tailgate.training.adaptive import Adaptive, plan_of, stem
 
 from .damage import PLAYED, Table
 from .files import read_json
-from .schema import Data, SearchedLine
+from .part import Data
+from .search_results import SearchedLine
 
 ENDING = ".search.json"
 FILES = ("policy:path=", "program:path=")  # attacks that lie in files
@@ -53,7 +54,7 @@ def search(
     """
     plan = plan_of(suite)
     if set(str(out)) & set(MARKS):
-        raise InputError("--out", str(out), f"a path without any of {MARKS}: it stands in the texts of attacks")
+        raise InputError("--out", str(out), f"a path without any of {MARKS}, as the texts of attacks hold it")
     jobs = jobs_of(suite, defence, (), plan.searched(suite), plan.ensemble, 0)
     spec = Spec("defence", defence)
     folder = writable_directory(out / "searches" / stem(defence))

@@ -201,7 +201,7 @@ def attack(
     sizes.check("episodes", episodes)
     update = progress or (lambda *_: None)
     if out is not None and set(str(out)) & set(MARKS):
-        raise InputError("--out", str(out), f"a path without any of {MARKS}: it stands in the texts of attacks")
+        raise InputError("--out", str(out), f"a path without any of {MARKS}, as the texts of attacks hold it")
     jobs = jobs_of(suite, defence, scenarios, doses, budget, seed)
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory())) if out is None else writable_directory(out, "--out")

@@ -213,7 +213,7 @@ def ranked_against(suite: Suite) -> str:
         return ""
     plan = adaptive.plan_of(own)
     if plan.ensemble and not plan.learners:
-        return f"the standard attack ensemble, budget {plan.ensemble}, which searches anew against each defence"
+        return f"the standard attack ensemble, budget {plan.ensemble}, which searches against each defence"
     learners = " and ".join(name.upper() for name in plan.learners)
     said = f"{learners}, {' and '.join(plan.knowledge)} box, {plan.seeds} training seeds of each"
     less = not ({*plan.learners} >= WHOLE[0] and {*plan.knowledge} >= WHOLE[1] and plan.seeds >= WHOLE[2])

@@ -1,4 +1,4 @@
-"""What the standard attack ensemble found, on the first page of a board's site."""
+"""Attacks of the standard ensemble on the first page of a board's site."""
 
 from __future__ import annotations
 
