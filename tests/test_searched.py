@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import json
+import lzma
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,11 @@ from tailgate.base.errors import InputError
 from tailgate.board import searched
 from tailgate.board.check import SCORED
 from tailgate.board.damage import damaged, reach_of
-from tailgate.board.files import read_board
+from tailgate.board.files import board_in, load, read_board, save
 from tailgate.board.run import board_of, files_of_rows
 from tailgate.board.score import score
 from tailgate.cli import board as command
+from tailgate.cli import main
 from tailgate.core.scenario import load_suite
 from tailgate.ensemble import standard
 from tailgate.ensemble.battery import Played
@@ -173,3 +175,24 @@ def test_what_each_member_adds() -> None:
     assert (scripts["cells"], scripts["alone"]) == (3, 1) and scripts["adds"] == pytest.approx(0.1 / 3)
     assert (networks["cells"], networks["alone"]) == (2, 1) and networks["adds"] == pytest.approx(0.2)
     assert (white["cells"], white["alone"]) == (2, 1) and white["adds"] == pytest.approx(0.2) and white["damage"] == pytest.approx(0.75)
+
+
+def test_a_packed_board_is_read_and_kept_packed(made: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    """The head of both files is the same; scoring goes on with the packed one; a damaged one is refused in one line."""
+    file, folder = made
+    plain = folder / "board.json"
+    data = load(plain)
+    packed = Path(f"{plain}.xz")
+    save(data, packed)
+    plain.unlink()
+    assert board_in(folder) == packed and load(packed) == data and packed.stat().st_size < 20_000
+    capsys.readouterr()
+    assert main(["leaderboard", "head", str(packed)]) == 0 and "| chi2_kf" in capsys.readouterr().out
+    _run(str(file), "--out", "out", "--score-only")
+    assert not plain.exists() and load(packed) == data
+    packed.write_bytes(packed.read_bytes()[:-20])
+    capsys.readouterr()
+    assert main(["leaderboard", "head", str(packed)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    packed.write_bytes(lzma.compress(b" " * (80 << 20)))
+    assert main(["leaderboard", "head", str(packed)]) == 2

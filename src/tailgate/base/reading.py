@@ -73,8 +73,21 @@ def parse_json(content: bytes | str, strict: bool = True) -> Any:
 
 
 def load_json(path: Path, strict: bool = True) -> Any:
-    """Read a JSON file, as `parse_json` does."""
-    return parse_json(read_bytes(path), strict)
+    """Read a JSON file, as `parse_json` does; unpack one named *.xz."""
+    return parse_json(_unpacked_whole(path) if path.suffix == ".xz" else read_bytes(path), strict)
+
+
+def _unpacked_whole(path: Path) -> bytes:
+    """Return the unpacked content of a file. Raises ValueError for one that is damaged, OSError for one that unpacks to too much."""
+    held = bytearray()
+    try:
+        for piece in _unpacked(path):
+            held += piece
+            if len(held) > LARGEST:
+                raise OSError(errno.EFBIG, f"more than {LARGEST} bytes unpacked")
+    except (EOFError, lzma.LZMAError) as error:
+        raise ValueError(f"no whole xz file ({error})") from None
+    return bytes(held)
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

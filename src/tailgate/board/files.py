@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import lzma
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -19,6 +20,8 @@ from tailgate.evaluation.stats import mean_time
 
 from .schema import FORMAT, AtThreshold, Board, Data, Detection, EntryTrust, Part
 
+BOARD = "board.json"
+
 
 def load(path: Path) -> Any:
     """Return the JSON data of a board's file, to be read by `read_board`."""
@@ -34,9 +37,16 @@ def read_json(path: Path, where: str, what: str = "JSON file", hint: str = "") -
         raise InputError(where, str(path), f"a readable {what} ({said(error)}){hint}") from None
 
 
+def board_in(folder: Path) -> Path:
+    """Return the file of the board in a suite's folder: the packed one where there is one."""
+    packed = folder / f"{BOARD}.xz"
+    return packed if packed.is_file() else folder / BOARD
+
+
 def save(board: Data, path: Path) -> None:
-    """Put a board, as JSON data, into a file, in one step, and remove what a killed writer of it left."""
-    write_atomic(path, json.dumps(board, indent=1, allow_nan=False).encode() + b"\n")
+    """Put a board, as JSON data, into a file, in one step, packed if it is named *.xz; remove what a killed writer of it left."""
+    content = json.dumps(board, indent=1, allow_nan=False).encode() + b"\n"
+    write_atomic(path, lzma.compress(content) if path.suffix == ".xz" else content)
     sweep(path)
 
 

@@ -20,7 +20,7 @@ from tailgate.trust.run import REPORT, with_trust
 
 from .card import with_cards
 from .cells import shared_of
-from .files import agree, load, read_board, read_json, save
+from .files import agree, board_in, load, read_board, read_json, save
 from .schema import Data
 from .score import score
 from .searched import searches_in
@@ -28,7 +28,6 @@ from .update import with_kept
 from .verified import digest, with_verified
 
 OWN = "rows.jsonl.xz"  # rows of `run`; other files of rows come from `attack` and `submit`
-BOARD = "board.json"
 LIST = "attacks.jsonl"
 CARDS = "cards"  # folder of what authors say of their entries
 TRUST = "trust"  # folder that `tailgate trust` wrote
@@ -100,7 +99,8 @@ def board_of(
     files = files_of_rows(folder)
     if not files:
         raise InputError("rows", str(folder), "a folder with rows of `leaderboard run`")
-    before = kept_board(folder / BOARD, suite, beacon or "") if keep else load(folder / BOARD) if (folder / BOARD).is_file() else None
+    path = board_in(folder)
+    before = kept_board(path, suite, beacon or "") if keep else load(path) if path.is_file() else None
     parts = {path: read_rows(path) for path in files}
     if keep and (other := {row["version"] for rows in parts.values() for row in rows} - {VERSION}):
         raise InputError("rows: version", min(other), f"{VERSION}, as the board's")
@@ -116,7 +116,7 @@ def board_of(
         board = with_trust(board, read_json(report, "trust"), f"trust {report}", suite)
     if before is not None:
         board = with_kept(board, before)
-    save(board, folder / BOARD)
+    save(board, path)
     return board
 
 

@@ -45,12 +45,12 @@ def add(actions: Commands) -> None:
     command.add_argument("--json", action="store_true", help="print the entries as JSON")
     command.set_defaults(run=_run, kept="the same command goes on")
     page = actions.add_parser("page", help="build the page of boards")
-    page.add_argument("boards", nargs="+", metavar="FILE", help="board.json files")
+    page.add_argument("boards", nargs="+", metavar="FILE", help="board.json or board.json.xz files")
     page.add_argument("--out", required=True, metavar="DIR", help="directory of the page")
     add_options(page, "--title", "--no-replays")
     page.set_defaults(run=_page)
     head = actions.add_parser("head", help="print the head of a board as a Markdown table")
-    head.add_argument("board", metavar="FILE", help="board.json")
+    head.add_argument("board", metavar="FILE", help="board.json, or board.json.xz")
     head.add_argument("--most", type=int, metavar="N", help="print at most N defences, the first in the order of the page (default: all)")
     head.set_defaults(run=_head)
 
@@ -60,7 +60,8 @@ def _run(options: argparse.Namespace) -> int:
     from tailgate.board.attachments import Attachments
     from tailgate.board.attacked import attack
     from tailgate.board.detect import detect
-    from tailgate.board.run import BOARD, board_of, kept_board, play
+    from tailgate.board.files import board_in
+    from tailgate.board.run import board_of, kept_board, play
     from tailgate.board.run_record import Record
     from tailgate.core.scenario import load_suite
     from tailgate.site.build import build_site
@@ -74,8 +75,8 @@ def _run(options: argparse.Namespace) -> int:
     out, started = Path(options.out), time.perf_counter()
     suites = [load_suite(name) for name in options.suites]
     for suite in suites:
-        Attachments.of(out / suite.name / BOARD)  # refuses what is no such file before anything is played
-    kept = {suite.name: kept_board(out / suite.name / BOARD, suite, options.beacon) for suite in suites if options.keep_entries}
+        Attachments.of(board_in(out / suite.name))  # refuses what is no such file before anything is played
+    kept = {suite.name: kept_board(board_in(out / suite.name), suite, options.beacon) for suite in suites if options.keep_entries}
     boards = []
     with contextlib.ExitStack() as locks, progress(Console(stderr=True)) as update:
         for folder in sorted({out / suite.name for suite in suites}):
@@ -102,8 +103,8 @@ def _run(options: argparse.Namespace) -> int:
             if left:
                 board = board_of(suite, folder, beacon=options.beacon or None, keep=options.keep_entries)
             print(record.finish(board["suite"]["rows"]), file=sys.stderr)
-            boards.append(detect(folder / BOARD, suite, workers=options.workers, progress=update) if options.detection else board)
-    measured = [Attachments.of(out / suite.name / BOARD) for suite in suites]
+            boards.append(detect(board_in(folder), suite, workers=options.workers, progress=update) if options.detection else board)
+    measured = [Attachments.of(board_in(out / suite.name)) for suite in suites]
     page = build_site(boards, out / "page", replays=not options.no_replays, measured=measured)
     if options.json:
         print_json([{"suite": b["suite"]["name"], "entries": b["entries"]} for b in boards])

@@ -24,7 +24,7 @@ def add(actions: Commands) -> None:
         "stealth impact are played again instead. Exit code 1 when anything differs, or nothing could be checked. Registered names, the "
         "zoo, and files of policies that are here are played; a board never makes this command import code.",
     )  # fmt: skip
-    command.add_argument("board", metavar="FILE", help="board.json")
+    command.add_argument("board", metavar="FILE", help="board.json, or board.json.xz")
     command.add_argument("--sample", type=int, metavar="N", help="check N cells, drawn at random (default: all)")
     add_options(command, "--sample-seed")
     command.add_argument("--defence", action="append", default=[], metavar="NAME", help="only the cells of these defences (repeatable)")

@@ -36,13 +36,12 @@ def add(actions: Commands) -> None:
 def _detect(options: argparse.Namespace) -> int:
     from tailgate.board.detect import detect
     from tailgate.board.detection import Effort
-    from tailgate.board.files import load
-    from tailgate.board.run import BOARD
+    from tailgate.board.files import board_in, load
     from tailgate.core.scenario import load_suite
 
     own_classes()
     suite = load_suite(options.suite)
-    path = Path(options.out) / suite.name / BOARD
+    path = board_in(Path(options.out) / suite.name)
     hours = None if options.hours is None else tuple(options.hours)
     given = {"hours": hours, "episodes": options.episodes, "onsets": options.onsets, "most_steps": options.steps}
     given["checked"] = options.checked

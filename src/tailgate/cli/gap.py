@@ -24,15 +24,14 @@ def add(actions: Commands) -> None:
 
 def _gap(options: argparse.Namespace) -> int:
     from tailgate.board.equal_gap import measure_gap
-    from tailgate.board.files import load
-    from tailgate.board.run import BOARD
+    from tailgate.board.files import board_in, load
     from tailgate.board.words import at_least
     from tailgate.core.scenario import load_suite
 
     suite = load_suite(options.suite)
     folder = Path(options.out) / suite.name
     with working() as update:
-        found = measure_gap(load(folder / BOARD), suite, options.defence, progress=counted(update, "equal gap", "entries"))
+        found = measure_gap(load(board_in(folder)), suite, options.defence, progress=counted(update, "equal gap", "entries"))
     path = None if options.defence else found.write(folder)  # part of a file would lose the rest
     if options.json:
         print(found.text(), end="")

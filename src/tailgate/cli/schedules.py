@@ -26,15 +26,14 @@ def add(actions: Commands) -> None:
 
 
 def _timing(options: argparse.Namespace) -> int:
-    from tailgate.board.files import load
-    from tailgate.board.run import BOARD
+    from tailgate.board.files import board_in, load
     from tailgate.board.timing import measure_timing
     from tailgate.core.scenario import load_suite
     from tailgate.site.timing import points
 
     suite = load_suite(options.suite)
     folder = Path(options.out) / suite.name
-    board = load(folder / BOARD)
+    board = load(board_in(folder))
     with working() as update:
         timing = measure_timing(
             board, suite, options.defence, episodes=options.episodes,
