@@ -42,7 +42,8 @@ def attack(
     if plan.ensemble and not plan.learners and (changes or seeds is not None):
         field, value = ("--set", changes[0]) if changes else ("--seeds", seeds)
         raise InputError(field, value, f"no such option, as {suite.name} asks for a search and for no training")
-    configs = configs_of(suite, defence, out / "policies", seeds=seeds, extra=(*changes, f"workers={workers}"))
+    changes = (*changes, f"workers={workers}")
+    configs = configs_of(suite, defence, out / "policies", seeds=seeds, extra=changes) if plan.learners else []
     policies = train_against(configs, progress)
     groups: dict[tuple[str, ...], list[str]] = {}  # a policy plays where the attacker sees and may do what it learned with
     for config in configs:

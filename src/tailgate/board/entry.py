@@ -29,6 +29,7 @@ CLEAN_METRICS = (
     "alarm_rate", "alarm_onsets", "muted_steps",
 )  # fmt: skip
 CLAIMED = "claimed"  # how the reason begins of an entry whose figures nobody but its author has seen come about
+PROVISIONAL = "provisional"  # how it begins of one that its author ranks for a look
 Levels = dict[str, dict[str, Worst]]  # by defence and knowledge
 
 
@@ -46,12 +47,13 @@ def shown(suite: Suite) -> list[int]:
 
 def entry_of(
     table: Table, defence: str, levels: dict[str, Worst], dose: int, origins: dict[str, Row], trained: dict[str, str],
-    asked: list[Asked] | None, searches: Sequence[Data],
+    asked: list[Asked] | None, searches: Sequence[Data], provisional: Collection[str] = (),
 ) -> Data:  # fmt: skip
     """Return the entry of a defence that is made of rows: status, gates, flags, worst episode and figures.
 
     origins: how each learned attack was trained. trained: the defence that an attack was made against. asked: the suite's trainings; None
-    where a rank asks for no attack of this kind. searches: the results of the standard ensemble.
+    where a rank asks for no attack of this kind. searches: the results of the standard ensemble. provisional: defences that are ranked
+    although nobody but their author has played them.
     """
     rows = [row for key in sorted(table.cells) if key.defence == defence for row in table.cells[key]]
     uses = [str(use) for use in rows[0]["uses"]]
@@ -61,10 +63,12 @@ def entry_of(
     status = "unranked" if why else "ranked"
     if not why and asked is not None and (short := _draft(table)):
         status, why = "unranked", short
-    if not why and card is None and (how := _claimed(rows)):
+    if not why and card is None and (how := _claimed(rows)) and defence not in provisional:
         status, why = "unranked", how
     if not why and asked is not None and (missing := _unmet(table, defence, origins, asked, searches)):
         status, why = "unattacked", missing
+    if not why and defence in provisional:
+        why = f"{PROVISIONAL}: played by its author"
     whole = {k: worst for k, worst in levels.items() if worst.complete}
     return {
         "defence": defence, "card": None if card is None else card.card(), "uses": uses, "class": class_of(uses),

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
-from .entry import CLAIMED
+from .entry import CLAIMED, PROVISIONAL
 from .schema import LEVELS, Critical, Entry
 
 GROUPS = (  # status, title, what it means
@@ -17,7 +17,7 @@ GROUPS = (  # status, title, what it means
 
 
 def ordered(entries: Iterable[Entry]) -> list[Entry]:
-    """Return entries by group, classes that claim their figures first, then by class, rank and critical dose."""
+    """Return entries by group, classes of authors who claim their figures first, then by class, rank and critical dose."""
     return sorted(entries, key=place_of)
 
 
@@ -33,4 +33,4 @@ def place_of(entry: Entry) -> tuple[Any, ...]:
     status = [name for name, *_ in GROUPS].index(entry.status)
     rank = (entry.rank.best, entry.rank.worst) if entry.rank else (math.inf, math.inf)
     doses = [-sort_dose(entry.critical_dose.get(level)) for level in LEVELS]
-    return (status, not entry.why.startswith(CLAIMED), entry.class_.count("+"), entry.class_, rank, doses)
+    return (status, not entry.why.startswith((CLAIMED, PROVISIONAL)), entry.class_.count("+"), entry.class_, rank, doses)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import lzma
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 from tailgate.base.errors import InputError
@@ -88,7 +88,8 @@ def _one_round(folder: Path, beacon: str) -> None:
 
 
 def board_of(
-    suite: Suite, folder: Path, beacon: str | None = None, keep: bool = False, *, require_adaptive: bool = True
+    suite: Suite, folder: Path, beacon: str | None = None, keep: bool = False, *, require_adaptive: bool = True,
+    provisional: Collection[str] = (),
 ) -> Data:  # fmt: skip
     """Score all rows in a folder, with verified/*.json and the bounds of trust/trust.json, and write board.json. Returns the board.
 
@@ -107,6 +108,7 @@ def board_of(
     board = score(
         (row for rows in parts.values() for row in rows), suite, attacks=list_of(suite, folder / LIST),
         board=before if keep else None, require_adaptive=require_adaptive, searches=searches_in(folder),
+        provisional=provisional,
     )  # fmt: skip
     if beacon is not None and board["suite"]["beacon"] != beacon:
         raise InputError("beacon", beacon, f"that of the rows, {board['suite']['beacon'] or 'which are of public seeds'}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 from tailgate.base.errors import InputError
 from tailgate.base.version import VERSION
@@ -26,7 +26,7 @@ from .worst import Worst
 
 def score(
     rows: Iterable[Row], suite: Suite, *, attacks: Sequence[Admitted] | None = None, alpha: float = 0.05, require_adaptive: bool = True,
-    board: Data | None = None, shared: Sequence[str] = (), searches: Sequence[Data] = (),
+    board: Data | None = None, shared: Sequence[str] = (), searches: Sequence[Data] = (), provisional: Collection[str] = (),
 ) -> Data:  # fmt: skip
     """Return the board of a suite from its rows, in the format of decision record 14. The order of the rows changes nothing.
 
@@ -42,6 +42,8 @@ def score(
         Attacks on no list that every defence has to have met (`cells.shared_of`).
     searches
         What the standard ensemble found (`searched.searches_in`), where the suite asks for it.
+    provisional
+        Defences that take a rank although nobody but their author has played them.
 
     Raises
     ------
@@ -72,7 +74,7 @@ def score(
     trained |= {attack: str(origin["defence"]) for attack, origin in origins.items()} | found_for(searches)
     found = [
         extended(kept[d], table, levels[d], dose, trained, added[d]) if d in added else dict(kept[d]) if d in kept
-        else entry_of(table, d, levels[d], dose, origins, trained, asked, searches) for d in table.defences
+        else entry_of(table, d, levels[d], dose, origins, trained, asked, searches, provisional) for d in table.defences
     ]  # fmt: skip
     cells = ordered([*cells_of(table), *(held.cells if held else ())], table)
     return {

@@ -109,12 +109,13 @@ def _run(options: argparse.Namespace) -> int:
     if options.json:
         print_json([{"suite": b["suite"]["name"], "entries": b["entries"]} for b in boards])
     for board in () if options.json else boards:
-        _print_board(board)
+        print_board(board)
     print(f"page: {page} ({(time.perf_counter() - started) / 60:.1f} min)", file=sys.stderr)
     return 0
 
 
-def _print_board(board: dict[str, Any]) -> None:
+def print_board(board: dict[str, Any]) -> None:
+    """Print the head of a board as a table."""
     from tailgate.board.head import lines, title
 
     headings, *rows = lines(board)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from tailgate.base.errors import InputError
@@ -51,11 +51,13 @@ def _suites(boards: Sequence[Data]) -> list[Suite]:
 
 
 def build_site(
-    boards: Sequence[Data], out: Path, *, title: str | None = None, replays: bool = True, measured: Sequence[Attachments] = ()
-) -> Path:
+    boards: Sequence[Data], out: Path, *, title: str | None = None, replays: bool | Collection[str] = True,
+    measured: Sequence[Attachments] = (),
+) -> Path:  # fmt: skip
     """Write the site of `boards` (format tailgate-board-1) to the folder `out` and return the path of its first page.
 
-    replays: play each entry's worst episode again and write its page; without, the entries' pages say that it was not done.
+    replays: play each entry's worst episode again and write its page, or those of the defences that the user names, whose classes
+    may be imported for it. The pages of the others say that it was not done.
     measured: the attachments of each board.
     Raises InputError before anything is written: for no board, two of a suite, a field that breaks the format, and
     attachments of another suite.
@@ -79,8 +81,9 @@ def build_site(
             also = [(s.board.suite.name, f"../{s.pages[entry.defence]}") for s in suites if s is not suite and entry.defence in s.pages]
             replay = f"{page.removesuffix('.html')}-replay.html"
             done = Replayed(why="Replays were not asked for.")
-            if replays:
-                done = replay_of(entry.worst_episode, folder / replay, f"worst episode of suite {name}")
+            if replays is True or (replays and entry.defence in replays):
+                named = None if replays is True else entry.defence
+                done = replay_of(entry.worst_episode, folder / replay, f"worst episode of suite {name}", named)
             if done.page:
                 hashes[replay] = hashlib.sha256((folder / replay).read_bytes()).hexdigest()
             files[page] = pages.render("entry.html", of=entry, suite=suite, entry=entry_page(suite, entry, done, also, one))

@@ -15,7 +15,7 @@ from tailgate.board.words import names_of, percent
 from tailgate.core.registry import Spec
 from tailgate.play.metrics import ERRORS, METRICS, UNITS
 from tailgate.replay.page import VERDICTS, outcome, write_page
-from tailgate.replay.replay import play
+from tailgate.replay.replay import Filter, play
 
 from . import alarms, measures
 from .cards import card_of
@@ -37,16 +37,16 @@ class Replayed:
     why: str = ""
 
 
-def replay_of(row: Mapping[str, Any] | None, out: Path, source: str) -> Replayed:
+def replay_of(row: Mapping[str, Any] | None, out: Path, source: str, named: str | None = None) -> Replayed:
     """Play the row and write its page to `out`.
 
     A board may come from anybody: its row may be of another version, incomplete, or name a file or a class that is not here. Then the
-    reason is returned: one row must not cost the site.
+    reason is returned: one row must not cost the site. named: a defence that the user has named, whose class may be imported.
     """
     if row is None:
         return Replayed(why="The board holds no worst episode of this defence.")
     try:
-        replay = play(dict(row))
+        replay = play(dict(row), Filter(defence=named))
         page = write_page(replay, out, source)
     except Exception as error:
         return Replayed(why=_reason(error, row))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 
 from tailgate.board.attachments import Attachments
+from tailgate.board.entry import PROVISIONAL
 from tailgate.board.order import GROUPS, ordered
 from tailgate.board.schema import LEVELS, CellLine, Data, Dose, Level
 from tailgate.board.words import Name, at_least, percent
@@ -40,7 +41,7 @@ def _lines(suite: Suite, measured: Attachments) -> list[Data]:
             "rates": [{level: rates.get((dose, level), share_of(None)) for level in LEVELS} for dose in suite.shown],
             "measures": measures.cells_of(suite, entry, columns), "trust": trust_cell(suite, entry), "gates": gates_of(entry),
             "flags": [*entry.flags, *flags_of(measured.timing, entry.defence), *alarms.drifts_of(suite, entry.defence)],
-            "status": entry.status, "why": entry.why,
+            "status": entry.status, "why": entry.why, "own": entry.why.startswith(PROVISIONAL),
         })  # fmt: skip
     return out
 

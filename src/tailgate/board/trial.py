@@ -1,0 +1,90 @@
+"""A class of one's own on the published board of a suite: played, attacked, and ranked for a look."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib.resources import files
+from pathlib import Path
+from typing import NamedTuple
+
+from tailgate.base.errors import InputError
+from tailgate.base.files import writable_directory
+from tailgate.base.progress import cells
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Suite
+
+from .attacked import Progress, attack
+from .files import agree, board_in, load, read_board, save
+from .run import board_of, play
+from .schema import Data
+
+SHIPPED = "boards"  # folder of the package with published boards
+
+
+class Trial(NamedTuple):
+    """The board with the class on it, its file, and its line."""
+
+    board: Data
+    file: Path
+    entry: Data
+
+
+def published(suite: Suite) -> Data | None:
+    """Return the board of a suite that comes with the package, None where there is none of this version of the suite."""
+    path = Path(str(files("tailgate.configs").joinpath(SHIPPED, f"{suite.name}.json.xz")))
+    if not path.is_file():
+        return None
+    data: Data = load(path)
+    return data if data["suite"]["hash"] == suite.hash else None
+
+
+def try_out(
+    suite: Suite, defence: str, out: Path, *, workers: int = 1, progress: Progress, board: Path | None = None,
+    say: Callable[[str], None] = lambda _: None,
+) -> Trial:  # fmt: skip
+    """Play a defence on a suite, attack it as the suite's plan says, and rank it among the entries of a board.
+
+    The rank is a provisional one: the author has played the class, on seeds that everybody knows. An interrupted trial goes on.
+
+    Parameters
+    ----------
+    suite, defence
+        A suite, and a defence on a command line, such as module:Class.
+    out
+        Folder of what is made; rows, attackers and board of a suite lie in out/DIGEST/SUITE, with the digest of the class's files.
+    board
+        The board that it joins; by default the published one of the package. Without any it is alone with the undefended car.
+
+    Raises
+    ------
+    InputError
+        For a class in a sandbox, a defence that the suite plays already, and a board of another suite.
+    """
+    spec = Spec("defence", defence)
+    if spec.sandboxed:
+        raise InputError("defence", defence, "a class without a sandbox, module:Class; `leaderboard submit` plays it in one")
+    if defence in suite.defences:
+        raise InputError("defence", defence, f"a class of yours: {suite.name} plays this one")
+    held = published(suite) if board is None else load(board)
+    if held is not None:
+        agree(read_board(held), suite)
+    folder = writable_directory(out / (spec.digest[:8] or "built-in") / suite.name)  # rows of a class that was changed lie elsewhere
+    path, keep = board_in(folder), held is not None
+    if held is not None and not path.is_file():
+        save(held, path)
+    play(
+        suite, folder, defences=[defence], workers=workers, board=load(path) if keep else None,
+        progress=lambda name, done, total: progress(name, done, total, cells(done, total)),
+    )  # fmt: skip
+    made = board_of(suite, folder, keep=keep, provisional=[defence])
+    entry = _entry(made, defence)
+    if entry["status"] == "unattacked":
+        say(f"attacking {defence}: {entry['why']}")
+        attack(suite, defence, folder / "attacked", workers=workers, progress=progress)
+        made = board_of(suite, folder, keep=keep, provisional=[defence])
+        entry = _entry(made, defence)
+    return Trial(made, path, entry)
+
+
+def _entry(board: Data, defence: str) -> Data:
+    return next(entry for entry in board["entries"] if entry["defence"] == defence)
