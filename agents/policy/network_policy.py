@@ -27,7 +27,7 @@ from tailgate.core.draws import Draws, Role
 from tailgate.core.neural import Lstm, Memory, Network, pair, perceptron, read_trained
 from tailgate.core.registry import register
 from tailgate.core.schema import as_data
-from tailgate.core.threat import Brief
+from tailgate.core.threat import Brief, Knowledge
 from tailgate.envs.gym.actions import ActionCodec, ActionSpec
 from tailgate.envs.gym.observations import FRAMES, ObservationCodec
 
@@ -43,7 +43,7 @@ class Seen:
 
     action: ActionSpec
     observation: tuple[str, ...]
-    knowledge: Literal["black", "grey", "white"]
+    knowledge: Knowledge
     sees_measurement: bool = False
     frames: PositiveCount = 1
     agents: PositiveCount | None = None  # agents of the system that it was trained on; older files have none

@@ -22,6 +22,7 @@ from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import LoopState
 from tailgate.core.registry import Spec, entry_for
 from tailgate.core.schema import as_data, build, digest, fields_of
+from tailgate.core.threat import KNOWLEDGE
 from tailgate.envs.gym.actions import ActionSpec
 from tailgate.envs.gym.attacker_mdp import CAR_FOLLOWING, FACES, Outcome, Seat, Tally
 from tailgate.envs.gym.mixture import Mixture
@@ -247,7 +248,7 @@ class DefenderEnv(Specified, gymnasium.Env[Array, Any]):
         if not all(callable(getattr(player, name, None)) for player in made for name in ("prepare", "start", "decide")):
             raise InputError("attack", attack, "a registered name, a policy's file, or an object with prepare, start and decide")
         known = [getattr(player, "knowledge", entry_for("attack", type(player)).knowledge) for player in made]
-        arguments.setdefault("knowledge", max(known, key=("black", "grey", "white").index))
+        arguments.setdefault("knowledge", max(known, key=KNOWLEDGE.index))
         self.duel = Duel.make(**arguments)
         self.attack: Attack = made[0] if len(made) == 1 else Mixture(tuple(made))
         self.attack.prepare(self.duel.seat.loop.brief)  # fail here, not in the first step

@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 import yaml
 from safetensors import SafetensorError
 
+YAML_ENDS = (".yaml", ".yml")  # of file names
 LARGEST = 64 << 20  # [bytes] of a JSON, CSV or JSON Lines file that is read as a whole
 YAML = 256 << 10  # [bytes] of a YAML file; parsing this much takes seconds
 NODES = 100_000  # values of a YAML file; an alias counts each time it is used

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-Level = Literal["black", "grey", "white"]
-LEVELS: tuple[Level, ...] = ("black", "grey", "white")  # what an attacker knows, from the least
+from tailgate.core.threat import KNOWLEDGE, Knowledge
+
+Level = Knowledge
+LEVELS: tuple[Level, ...] = KNOWLEDGE  # what an attacker knows, from the least
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Share = Annotated[float, Field(strict=True, ge=0.0, le=1.0)]
 Text = Annotated[str, Field(strict=True)]

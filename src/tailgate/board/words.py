@@ -10,9 +10,10 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
+from tailgate.base.reading import YAML_ENDS
 from tailgate.core.spec_text import split_text
 
-SUFFIXES = (".json", ".yaml", ".yml")  # of policies and programs
+SUFFIXES = (".json", *YAML_ENDS)  # of policies and programs
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from tailgate.base.errors import InputError, unknown
+from tailgate.base.reading import YAML_ENDS
 from tailgate.base.sizes import Episodes
 from tailgate.core import Defence, Positive, param
 from tailgate.core.loop import Loop
@@ -150,7 +151,7 @@ def _builtin(folder: str) -> dict[str, Path]:
 
 def config_path(folder: str, name: str, where: str) -> Path:
     """Return the path of a YAML file from its built-in name or its path."""
-    if name.endswith((".yaml", ".yml")):
+    if name.endswith(YAML_ENDS):
         return Path(name)
     known = _builtin(folder)
     if name not in known:
@@ -197,7 +198,7 @@ def load_suite(name: str) -> Suite:
     """Return a suite by name, or from a YAML file, whose components are checked at once: a typing error must not show hours later."""
     path = config_path("suites", name, "suite")
     suite = _read_suite(path)
-    if name.endswith((".yaml", ".yml")):
+    if name.endswith(YAML_ENDS):
         try:
             _look_through(suite)
         except InputError as error:

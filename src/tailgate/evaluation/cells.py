@@ -21,6 +21,7 @@ from tailgate.base import sizes, sources
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.files import write_atomic
 from tailgate.base.pool import each
+from tailgate.base.reading import YAML_ENDS
 from tailgate.base.version import VERSION
 from tailgate.core import Attack, Defence, Model, draws
 from tailgate.core.registry import Entry, Family, Spec, entry_for, said, text_of
@@ -126,7 +127,7 @@ def _why(error: Exception, seeds: Sequence[int] = ()) -> tuple[str, str]:
 def _head(cell: Cell, place: Scenario, defence: Entry, attack: Entry, identity: str) -> dict[str, Any]:
     threat = place.threat_model
     return {
-        "suite": cell.suite, "scenario": place.name, "scenario_file": cell.scenario if cell.scenario.endswith((".yaml", ".yml")) else "",
+        "suite": cell.suite, "scenario": place.name, "scenario_file": cell.scenario if cell.scenario.endswith(YAML_ENDS) else "",
         "threat_model": as_data(threat), "dose": threat.budget,
         "knowledge": threat.knowledge, "defence": cell.defence, "uses": list(defence.uses), "attack": cell.attack,
         "learned": attack.learned, "optimal": attack.optimal, "purpose": cell.purpose, "beacon": cell.beacon, "batch": cell.batch,

@@ -14,10 +14,10 @@ from typing import Any, TypeVar
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
+from tailgate.base.reading import YAML_ENDS
 from tailgate.core.draws import constants
 from tailgate.core.registry import Family, Spec
 
-YAML = (".yaml", ".yml")
 LAST_BITS = "only: decisions and figures agree, as between two platforms whose last bits differ"
 Data = dict[str, Any]
 Thing = TypeVar("Thing", bound=Hashable)
@@ -101,9 +101,9 @@ def sampling(sample: int | None, seed: int) -> Data:
 def files_of(spec: Spec) -> list[Path]:
     """Return the files that a component's text names."""
     head, params = spec._parts()
-    named = [head] if spec.family == "attack" and Path(head).suffix in (".json", *YAML) else []
+    named = [head] if spec.family == "attack" and Path(head).suffix in (".json", *YAML_ENDS) else []
     path, policy = params.get("path"), params.get("policy")
-    named += [path] if isinstance(path, str) and Path(path).suffix in (".json", *YAML) else []
+    named += [path] if isinstance(path, str) and Path(path).suffix in (".json", *YAML_ENDS) else []
     named += policy if isinstance(policy, list) else [policy] if policy is not None else []
     return [Path(str(name)) for name in named]
 

@@ -17,6 +17,7 @@ from typing import Any
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
+from tailgate.base.reading import YAML_ENDS
 from tailgate.base.version import VERSION
 from tailgate.core import draws
 from tailgate.core.registry import SANDBOXES, Family, Spec
@@ -24,7 +25,7 @@ from tailgate.core.scenario import list_scenarios, load_scenario
 from tailgate.core.schema import build, canonical
 from tailgate.core.threat import ThreatModel
 from tailgate.evaluation.cells import ENGINE, Cell, run
-from tailgate.evaluation.checks import LAST_BITS, YAML, Finding, Unplayable, again, counts, differences, drawn, files_of, sampling
+from tailgate.evaluation.checks import LAST_BITS, Finding, Unplayable, again, counts, differences, drawn, files_of, sampling
 from tailgate.evaluation.rounds import seeds_of
 from tailgate.evaluation.rows import Row
 
@@ -164,7 +165,7 @@ class _Cells:
         source = file or row["scenario"]
         if not file and source not in list_scenarios():
             raise Unplayable(f"scenario {source!r} is not built in, and the row names no file of it")
-        if file and not (source.endswith(YAML) and _readable(Path(source))):
+        if file and not (source.endswith(YAML_ENDS) and _readable(Path(source))):
             raise Unplayable(f"the file {source!r} of the row's scenario is not here")
         threat = row["threat_model"]
         if not isinstance(threat, dict) or not isinstance(row["versions"], dict):

@@ -17,6 +17,7 @@ import numpy as np
 
 from tailgate.base.errors import InputError
 from tailgate.base.pytree import duplicate
+from tailgate.base.reading import YAML_ENDS
 from tailgate.base.version import VERSION
 from tailgate.core import Array, Attack, Frame, draws
 from tailgate.core.draws import Keys, Role
@@ -28,8 +29,6 @@ from tailgate.core.threat import ThreatModel
 from tailgate.evaluation.cells import ENGINE
 from tailgate.play.metrics import measure
 from tailgate.play.trace import Recorder, Trace, signals_of
-
-YAML = (".yaml", ".yml")
 
 Row = dict[str, Any]
 Verdict = Literal["same", "decisions", "different", "unknown"]
@@ -55,7 +54,7 @@ class Filter:
     def _scenario_fits(self, row: Row) -> bool:
         if self.scenario in (None, row["scenario"], row.get("scenario_file")):
             return True
-        return str(self.scenario).endswith(YAML) and _name_of(str(self.scenario)) == row["scenario"]
+        return str(self.scenario).endswith(YAML_ENDS) and _name_of(str(self.scenario)) == row["scenario"]
 
     def _attack_fits(self, row: Row) -> bool:
         """Return True for the same text, or for a file elsewhere with the same content and parameters."""
@@ -272,7 +271,7 @@ def _component(family: Literal["defence", "attack"], row: Row, named: str | None
         )  # fmt: skip
     spec = held if named is None else Spec(family, named)
     head, _ = _split(spec.text)
-    if family == "attack" and Path(head).suffix in (".json", *YAML) and not spec.imports and not Path(head).is_file():
+    if family == "attack" and Path(head).suffix in (".json", *YAML_ENDS) and not spec.imports and not Path(head).is_file():
         raise InputError("the row's attack", spec.text, "an existing file; give its present path: --attack FILE")
     return spec
 
@@ -280,11 +279,11 @@ def _component(family: Literal["defence", "attack"], row: Row, named: str | None
 def _place(row: Row, named: str | None) -> Scenario:
     """Return the row's scenario with the row's threat model."""
     source = row.get("scenario_file") or row["scenario"]
-    if named is not None and named.endswith(YAML):
+    if named is not None and named.endswith(YAML_ENDS):
         source = named
-    elif source == row["scenario"] and not source.endswith(YAML) and source not in list_scenarios():
+    elif source == row["scenario"] and not source.endswith(YAML_ENDS) and source not in list_scenarios():
         raise InputError("the row's scenario", source, "a built-in one, or its file: --scenario FILE.yaml")
-    elif source.endswith(YAML) and not Path(source).is_file():
+    elif source.endswith(YAML_ENDS) and not Path(source).is_file():
         raise InputError("the row's scenario", source, "an existing file; give its present path: --scenario FILE.yaml")
     threat = row.get("threat_model")
     if not isinstance(threat, dict):

@@ -11,6 +11,7 @@ import functools
 from collections.abc import Mapping
 
 from tailgate.agents.policy.zoo import zoo_card, zoo_names
+from tailgate.base.reading import YAML_ENDS
 from tailgate.board.schema import Data, Entry
 from tailgate.board.words import Name
 from tailgate.core.registry import Entry as Registered
@@ -98,7 +99,7 @@ def _training(family: Family, name: Name, suite: Played | None) -> str:
 
 def own_card(suite: Suite, family: Family, name: Name) -> Data:
     """Return the card of what comes with the package, from registry, file of the class and suite; empty for anything else."""
-    base = "program" if name.base.endswith((".yaml", ".yml")) else name.base
+    base = "program" if name.base.endswith(YAML_ENDS) else name.base
     entry = _registered(family).get(base)
     if entry is None:
         return {}
