@@ -1,0 +1,89 @@
+"""Graphics cards: what the engine asks of one, which one plays, and the memory that is taken there."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any, Protocol
+
+from tailgate.base.errors import InputError, unknown
+from tailgate.engine.operations import Array
+
+DEVICES = ("cpu", "cuda")
+Argument = Any  # of a kernel: a whole number, an address, or an array of 64-bit numbers passed by value
+
+
+class OutOfMemory(Exception):
+    """The card has no room for so many bytes."""
+
+
+class Card(Protocol):
+    """A card, or what stands for one in tests. Addresses are the card's; copies wait for all work before them."""
+
+    name: str
+    kind: str  # what compiled code depends on: the card's capability, the compiler and its options
+    warps: int  # that run at once
+
+    def compiled(self, text: str) -> bytes:
+        """Return the machine code of CUDA C."""
+
+    def loaded(self, code: bytes, kernels: Sequence[str]) -> dict[str, Any]:
+        """Return the kernels of machine code."""
+
+    def launch(self, kernel: Any, grid: int, threads: int, arguments: Sequence[Argument]) -> None:
+        """Begin a kernel; it runs after all work before it."""
+
+    def taken(self, size: int) -> int:
+        """Return the address of new memory [bytes], all zeros; raise OutOfMemory if there is none."""
+
+    def given_back(self, at: int) -> None:
+        """Free memory."""
+
+    def free(self) -> int:
+        """Return how many bytes are free."""
+
+    def send(self, at: int, held: Array) -> None:
+        """Copy a contiguous array to the card."""
+
+    def fetch(self, held: Array, at: int) -> None:
+        """Copy from the card into a contiguous array."""
+
+    def send_rows(self, at: int, pitch: int, held: Array) -> None:
+        """Copy the rows (R, bytes) of a contiguous array to addresses `pitch` bytes apart."""
+
+    def fetch_rows(self, held: Array, at: int, pitch: int) -> None:
+        """Copy rows that are `pitch` bytes apart on the card into a contiguous array (R, bytes)."""
+
+
+class Memory:
+    """Memory on a card, freed with the last reference to it."""
+
+    def __init__(self, card: Card, size: int) -> None:
+        self.card, self.size = card, size
+        self.at = card.taken(max(size, 8))
+        weakref.finalize(self, card.given_back, self.at)
+
+
+def checked(device: object) -> str:
+    """Return the name of a device; raise InputError for others."""
+    if device not in DEVICES:
+        raise unknown("device", device, DEVICES)
+    return str(device)
+
+
+@cache
+def card() -> Card:
+    """Return this machine's card; raise InputError if there is none, or if its library or driver does not fit."""
+    return _found()
+
+
+def _nvidia() -> Card:
+    try:
+        from tailgate.engine.nvidia import Nvidia
+    except ImportError as error:
+        raise InputError("device", "cuda", "cpu, or NVIDIA's library: pip install 'tailgate[cuda]'") from error
+    return Nvidia()
+
+
+_found: Callable[[], Card] = _nvidia
