@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextvars import ContextVar
 from functools import cache
 from typing import Any, Protocol
 
@@ -12,6 +14,13 @@ from tailgate.engine.operations import Array
 
 DEVICES = ("cpu", "cuda")
 Argument = Any  # of a kernel: a whole number, an address, or an array of 64-bit numbers passed by value
+
+
+_device: ContextVar[str] = ContextVar("device", default="cpu")
+
+
+class DeviceError(InputError):
+    """A card that cannot play; it ends a run, where the error of a component costs its own rows only."""
 
 
 class OutOfMemory(Exception):
@@ -23,13 +32,16 @@ class Card(Protocol):
 
     name: str
     kind: str  # what compiled code depends on: the card's capability, the compiler and its options
-    warps: int  # that run at once
+    stream: int  # the queue of work, of those that the library of tensors has; 0 is the usual one
 
     def compiled(self, text: str) -> bytes:
         """Return the machine code of CUDA C."""
 
     def loaded(self, code: bytes, kernels: Sequence[str]) -> dict[str, Any]:
         """Return the kernels of machine code."""
+
+    def at_once(self, kernel: Any, threads: int) -> int:
+        """Return how many warps of a kernel run at once, in blocks of so many threads."""
 
     def launch(self, kernel: Any, grid: int, threads: int, arguments: Sequence[Argument]) -> None:
         """Begin a kernel; it runs after all work before it."""
@@ -72,9 +84,26 @@ def checked(device: object) -> str:
     return str(device)
 
 
+def device() -> str:
+    """Return the name of the device that plays here, see `playing_on`."""
+    return _device.get()
+
+
+@contextlib.contextmanager
+def playing_on(name: str) -> Iterator[None]:
+    """Play episodes on a device: cpu or cuda. Rows are the same; raise InputError if the device cannot play."""
+    if checked(name) == "cuda":
+        card()
+    before = _device.set(name)
+    try:
+        yield
+    finally:
+        _device.reset(before)
+
+
 @cache
 def card() -> Card:
-    """Return this machine's card; raise InputError if there is none, or if its library or driver does not fit."""
+    """Return this machine's card; raise DeviceError if there is none, or if its library or driver does not fit."""
     return _found()
 
 
@@ -82,7 +111,7 @@ def _nvidia() -> Card:
     try:
         from tailgate.engine.nvidia import Nvidia
     except ImportError as error:
-        raise InputError("device", "cuda", "cpu, or NVIDIA's library: pip install 'tailgate[cuda]'") from error
+        raise DeviceError("device", "cuda", "cpu, or NVIDIA's library: pip install 'tailgate[cuda]'") from error
     return Nvidia()
 
 

@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.base.errors import InputError
 from tailgate.engine import objects
-from tailgate.engine.cards import Card, Memory, OutOfMemory, card
+from tailgate.engine.cards import Card, DeviceError, Memory, OutOfMemory, card
 from tailgate.engine.cuda import KERNELS, LANES, THREADS, text_of
 from tailgate.engine.llvm import Layout
 from tailgate.engine.operations import Array
@@ -23,6 +22,7 @@ from tailgate.engine.program import Call, Program, State, Trace
 
 VERSION = "1"  # of this module's translation
 SPARE = 0.95  # of the free memory that rows may take
+SHARE = 0.5  # of the free memory that buffers may take
 
 
 class Code:
@@ -68,15 +68,19 @@ class CudaProgram(Program):
         return self.stride / LANES + steps * sum(nodes.size * nodes.flat[0].dtype.itemsize for nodes in arrays if nodes.size)
 
     def check(self, field: str, episodes: int, steps: int = 1) -> None:
-        """Raise InputError if the card has no memory for so many rows."""
+        """Raise DeviceError if the card has no memory for so many rows."""
         free = SPARE * self.card.free() - self.flights(episodes) * self.room
         most = max(0, int(free / self.bytes_of_row(steps)))
         if episodes > most:
-            raise InputError(field, episodes, f"at most {most:,} rows, which fit in the free memory of {self.card.name}; play in smaller batches")
+            raise DeviceError(field, episodes, f"at most {most:,} rows, which fit in the free memory of {self.card.name}; play in smaller batches")
 
     def flights(self, episodes: int) -> int:
-        """Return how many warps play so many episodes."""
-        return max(1, min(-(-episodes // LANES), self.card.warps))
+        """Return how many warps play so many episodes: those that run at once where each needs room for buffers, else all."""
+        blocks = -(-episodes // LANES)
+        if not self.room:
+            return blocks
+        fit = int(self.card.free() * SHARE / self.room)
+        return max(1, min(blocks, fit, max(self.card.at_once(kernel, THREADS) for kernel in self.function.kernels.values())))
 
 
 class DeviceState(State):
@@ -207,12 +211,12 @@ class DeviceCall(Call):
 
 
 def _memory(program: CudaProgram, size: int, episodes: int) -> Memory:
-    """Return memory on the program's card; raise InputError if there is none."""
+    """Return memory on the program's card; raise DeviceError if there is none."""
     try:
         return Memory(program.card, size)
     except OutOfMemory:
         program.check("episodes", episodes)
-        raise InputError("episodes", episodes, f"fewer rows: {program.card.name} has {program.card.free():,} bytes left") from None
+        raise DeviceError("episodes", episodes, f"fewer rows: {program.card.name} has {program.card.free():,} bytes left") from None
 
 
 def _whole(at: int, size: int) -> Array:

@@ -150,6 +150,9 @@ class Program:
         """Return a state of so many episodes."""
         return State(self, episodes)
 
+    def check(self, field: str, episodes: int, steps: int = 1) -> None:
+        """Raise InputError for `field` if the program's device has no memory for so many episodes."""
+
     def call(
         self, state: State, steps: int = 1, values: Sequence[Array] | None = None, threads: int = 1, like: Call | None = None
     ) -> Call:
