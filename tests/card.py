@@ -15,6 +15,9 @@ import pytest
 
 from tailgate.engine import cards
 from tailgate.engine.cuda import KERNELS
+from tailgate.engine.remembered import Remembered
+from tailgate.envs.gym import programs
+from tailgate.play import commanded, rollouts
 
 HEADER = Path(__file__).with_name("cuda_on_host.h")
 COMPILER = next((found for name in ("g++", "c++", "clang++") if (found := shutil.which(name))), None)
@@ -104,10 +107,17 @@ class HostCard:
         assert any(begin <= at and at + size <= begin + whole for begin, (whole, _) in self.held.items()), "outside of the card's memory"
 
 
+def forget(monkeypatch):
+    """No program of an earlier card is known."""
+    for module in (programs, commanded, rollouts):
+        monkeypatch.setattr(module, "_made", Remembered())
+
+
 @pytest.fixture
 def host_card(monkeypatch):
     """This processor in place of a card."""
     made = HostCard()
+    forget(monkeypatch)
     monkeypatch.setattr(cards, "_found", lambda: made)
     cards.card.cache_clear()
     yield made

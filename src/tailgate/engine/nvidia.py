@@ -194,7 +194,7 @@ def compiled(text: str, options: Sequence[str]) -> bytes:
     given = [option.encode() for option in options]
     code = nvrtc.nvrtcCompileProgram(program, len(given), given)[0]
     if int(code):
-        log = b" " * _compiler(nvrtc.nvrtcGetProgramLogSize(program))
+        log = bytearray(_compiler(nvrtc.nvrtcGetProgramLogSize(program)))
         nvrtc.nvrtcGetProgramLog(program, log)
         raise RuntimeError(f"the card's compiler: {_name(code)}: {log.decode(errors='replace')[:1000]}")
     held = bytearray(_compiler(nvrtc.nvrtcGetCUBINSize(program)))

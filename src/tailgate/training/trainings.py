@@ -19,6 +19,7 @@ from tailgate.base.pool import Crew, say
 from tailgate.base.reading import load_json
 from tailgate.core.registry import Spec
 from tailgate.core.schema import as_data
+from tailgate.engine.cards import playing_on
 
 if TYPE_CHECKING:
     from tailgate.training.train import TrainConfig
@@ -95,7 +96,7 @@ def _train(training: Training, report: Callable[[Progress], None]) -> Path:
     record = directory / f"curve-{seed}.json"
     before = spent(record) if resume and record.is_file() else 0.0
     started = time.process_time()  # of this process alone: others on the machine do not count
-    with _apart(config.defence):
+    with _apart(config.defence), playing_on(config.device or "cpu"):
         if resume and checkpoint.exists():
             learner.load(checkpoint)
         elif teacher is not None:
