@@ -29,6 +29,8 @@ _KINDS = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, *(ctypes.c_int64,) 
 class HostCard:
     """A card of some bytes; `warps` run at once."""
 
+    tensors = "cpu"
+
     def __init__(self, size: int = 1 << 33, warps: int = 3) -> None:
         self.name, self.warps, self.size, self.stream = "this processor", warps, size, 0
         self.kind = f"host {' '.join(OPTIONS)} {hashlib.sha256(HEADER.read_bytes()).hexdigest()}"

@@ -82,7 +82,7 @@ ENVIRONMENTS = [
     {"scenario": "radar-following-v0", "defence": "cra"},
     {"scenario": "platoon-gusty-v0", "defence": "lasso_dkf"},
     {"scenario": "network-noisy-v0", "defence": "dkf", "reward": "error", "action": "mode", "interval": 3},
-    {"scenario": "gusty-stop-and-go-v0", "defence": "imm_kf", "action": "continuous"},
+    {"scenario": "gusty-stop-and-go-v0", "defence": "imm", "action": "continuous"},
     {"scenario": "platoon-gusty-v0", "defence": "chi2_dkf"},
     {"scenario": "platoon-lossy-v0", "defence": "norm_resilient"},
     {"scenario": "thesis-ch5-v0", "defence": "norm_resilient", "reward": "error"},

@@ -79,6 +79,8 @@ def _first(error: Exception) -> str:
 class Nvidia:
     """The first visible card; see `tailgate.engine.cards.Card`."""
 
+    tensors = "cuda:0"
+
     def __init__(self) -> None:
         _, compiler = _begun()
         device = _ok(driver.cuDeviceGet(0))

@@ -146,6 +146,13 @@ class DeviceCall(Call):
         """The bytes of a sheet."""
         return self._size
 
+    def places(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any], int, tuple[int, ...]]]:
+        """Return the shape, type, first byte and strides [bytes] of each result on a sheet."""
+        out = {name: (place.shape, place.dtype, place.at, place.strides) for name, place in self._views}
+        for names, (shape, dtype, at, strides) in self._singles:
+            out |= {name: (shape[1:], dtype, at + i * strides[0], strides[1:]) for i, name in enumerate(names)}
+        return out
+
     def begin(self) -> None:
         """Begin a new sheet, which `play` fills."""
         self._begun = 0
