@@ -176,7 +176,7 @@ def test_out_of_memory_says_how_many_rows_fit(host_card: HostCard) -> None:
     env = AdversaryVectorEnv(fit // 32 * 32, device="cuda", **FOLLOWING)
     env.reset(seed=0)
     del env
-    with pytest.raises(DeviceError, match="fewer|at most"), playing_on("cuda"):
+    with pytest.raises(DeviceError, match=r"fewer|at most"), playing_on("cuda"):
         evaluate("quick-v0", **(PART | {"seeds": 2000}), batch=2000)
 
 
@@ -260,7 +260,7 @@ def test_what_a_card_does_not_play(host_card: HostCard, tmp_path: Any, monkeypat
     monkeypatch.setattr("tailgate.evaluation.cells.run_cell", played.append)
     with pytest.raises(DeviceError, match="cpu for filterpy_kf"):  # before the other cells are played
         evaluate("quick-v0", device="cuda", out=tmp_path / "rows.jsonl", **(PART | {"defences": ["chi2_kf", "filterpy_kf"]}))
-    with pytest.raises(DeviceError, match="device: got 'cuda'; expected cpu: .*FilterpyKalman is not traced"):
+    with pytest.raises(DeviceError, match=r"device: got 'cuda'; expected cpu: .*FilterpyKalman is not traced"):
         AdversaryVectorEnv(4, device="cuda", scenario="gusty-stop-and-go-v0", defence="filterpy_kf")
     assert not played and not (tmp_path / "rows.jsonl").exists()
     with playing_on("cuda"):

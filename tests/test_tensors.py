@@ -1,5 +1,8 @@
 """Tensors in place of arrays: the values of make_vec, on the processor and, with this processor in its place, on a card."""
 
+import runpy
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -90,6 +93,20 @@ def test_nothing_is_copied(host_card: HostCard) -> None:
     observation, *_ = env.step(torch.zeros(64, dtype=torch.int64))
     sheet = env.env.episodes.rows._decide.sheet
     assert sheet.ctypes.data <= observation.data_ptr() < sheet.ctypes.data + sheet.nbytes
+
+
+@needs_compiler
+def test_the_example_trains(host_card: HostCard, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """PPO in one file, on either device: the same lines but for the time."""
+    lines, threads = [], torch.get_num_threads()
+    for device in ("cpu", "cuda"):
+        words = ["--device", device, "--envs", "64", "--rollout", "40", "--steps", "7680", "--epochs", "1"]
+        monkeypatch.setattr(sys, "argv", ["ppo_on_device.py", *words])
+        torch.set_num_threads(1)
+        runpy.run_path(str(Path(__file__).parents[1] / "examples" / "ppo_on_device.py"))
+        lines.append([line.split("steps/s")[1] for line in capsys.readouterr().out.splitlines()])
+    torch.set_num_threads(threads)
+    assert lines[0] == lines[1] and len(lines[0]) > 0 and host_card.launches > 0
 
 
 @needs_compiler

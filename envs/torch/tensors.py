@@ -43,7 +43,7 @@ class TensorVecEnv:
             raise InputError("render_mode", arguments["render_mode"], "the device cpu")
         self.env = AdversaryVectorEnv(num_envs, device=device, **(FACES[id] | arguments))
         self.num_envs, self.horizon = num_envs, self.env.horizon
-        self.single_observation_space: gymnasium.spaces.Box = self.env.single_observation_space
+        self.single_observation_space = self.env.single_observation_space
         self.single_action_space = self.env.single_action_space
         self.autoreset_mode: AutoresetMode = self.env.autoreset_mode
         self._there: _OnCard | None = None
@@ -143,9 +143,10 @@ class _OnCard:
         self.card: Card = programs.decide.card  # type: ignore[attr-defined]
         whole = rows.state.blocks * programs.decide.lanes
         made: DeviceCall = programs.decide.call(rows.state, values=programs.values)  # type: ignore[assignment]
-        self._decide, self._advance = made, None
+        self._decide = made
+        self._advance: DeviceCall | None = None
         if programs.advance is not None and programs.between:
-            self._advance = programs.advance.call(rows.state, programs.between, programs.values, like=made)
+            self._advance = programs.advance.call(rows.state, programs.between, programs.values, like=made)  # type: ignore[assignment]
         self._begin: DeviceCall = programs.begin.call(rows.state, values=programs.values)  # type: ignore[assignment]
         self._given = {name: self._taken(whole, held) for name, held in made.arguments.items()}
         self._again = torch.zeros(whole, dtype=torch.bool, device=device)
@@ -207,7 +208,7 @@ class _OnCard:
         given["action"][:n], given["over"][:n] = actions, over
         given["again"][:n] = over if resets else False
         if self._advance is not None:
-            self._played(self._advance)  # type: ignore[arg-type]
+            self._played(self._advance)
         found = self._played(self._decide)
         terminated, truncated = found["terminated"], found["truncated"]
         if env._limit:

@@ -20,7 +20,7 @@ from tailgate.envs.torch.tensors import Tensor, TensorVecEnv
 
 
 class TailgateEnv(EnvBase):  # type: ignore[misc]
-    """`num_envs` environments under the keys observation, action, reward, done, terminated, truncated, and action_mask where actions are discrete.
+    """`num_envs` environments: observation, action, reward, done, terminated, truncated, and action_mask where actions are discrete.
 
     Arguments are those of `TensorVecEnv`, except `autoreset`: TorchRL resets rows itself. Rewards are float32, as TorchRL's losses want.
     """
@@ -35,6 +35,7 @@ class TailgateEnv(EnvBase):  # type: ignore[misc]
         self._begun = False
         self._actions = 0  # discrete ones
         space, action, rows = env.single_observation_space, env.single_action_space, (num_envs,)
+        assert isinstance(space, gymnasium.spaces.Box) and space.shape is not None
         limit = float(space.high.max())
         seen = {"observation": Bounded(-limit, limit, (*rows, *space.shape), self.device, torch.float32)}
         if isinstance(action, gymnasium.spaces.Discrete):

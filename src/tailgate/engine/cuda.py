@@ -4,7 +4,8 @@ A block of the state is a warp: its numbers lie lane by lane, so that the thread
 A branch is a branch, a sweep a loop, a buffer an address; a choice between buffers exchanges addresses.
 Code must be compiled without contraction (--fmad=false) and with exact division and square roots, which are the default.
 
-The text has two kernels of the same step. `play_step` plays one, with the state in memory; `play_steps` plays several, with the state in variables.
+The text has two kernels of the same step.
+`play_step` plays one, with the state in memory; `play_steps` plays several, with the state in variables.
 Both take these arguments:
 
 - the state, and the tables of numbers that all episodes share;

@@ -263,8 +263,8 @@ def _dense_text(name: str, begin: str, p: int, q: int) -> str:
 
 def _sparse_text(name: str, begin: str) -> str:
     """Return the text of a product row by row; `columns` and `last` are offsets in bytes of numbers."""
-    given = "const u64* __restrict__ table, const u64* __restrict__ columns, const u64* __restrict__ last, int rows, const double* x, int by"
-    given += ", double* out" + ("" if begin else ", const double* base, int step")
+    tables = ", ".join(f"const u64* __restrict__ {one}" for one in ("table", "columns", "last"))
+    given = f"{tables}, int rows, const double* x, int by, double* out" + ("" if begin else ", const double* base, int step")
     return f"""static __device__ __noinline__ void {name}({given}) {{
   i64 at = 0;
   for (int i = 0; i < rows; i++) {{

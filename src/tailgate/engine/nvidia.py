@@ -93,7 +93,8 @@ class Nvidia:
         known = [int(one) for one in _known()]
         architecture = self.capability[0] * 10 + self.capability[1]
         if self.capability < LEAST or architecture not in known:
-            raise _refused(f"a card of compute capability {min(known) / 10:.1f} to {max(known) / 10:.1f}; {self.name} has {architecture / 10:.1f}")
+            fit = f"{min(known) / 10:.1f} to {max(known) / 10:.1f}"
+            raise _refused(f"a card of compute capability {fit}; {self.name} has {architecture / 10:.1f}")
         self._processors = read(part.CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT)
         self._options = [f"--gpu-architecture=sm_{architecture}", *OPTIONS]
         self.kind = f"sm_{architecture} nvrtc {compiler[0]}.{compiler[1]} {' '.join(OPTIONS)}"

@@ -74,6 +74,7 @@ def folder() -> Path | None:
 
 
 def kept(name: str) -> bytes | None:
+    """Return the content of an object in the folder, or None."""
     place = folder()
     if place is None:
         return None
@@ -87,6 +88,7 @@ def kept(name: str) -> bytes | None:
 
 
 def keep(name: str, content: bytes) -> None:
+    """Write an object to the folder, if there is one."""
     place = folder()
     if place is None:
         return

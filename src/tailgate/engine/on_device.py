@@ -14,7 +14,8 @@ import numpy as np
 
 from tailgate.engine import objects
 from tailgate.engine.cards import Card, DeviceError, Memory, OutOfMemory, card
-from tailgate.engine.cuda import KERNELS, LANES, THREADS, text_of
+from tailgate.engine.cuda import KERNELS, THREADS, text_of
+from tailgate.engine.cuda_parts import LANES
 from tailgate.engine.llvm import Layout
 from tailgate.engine.operations import Array
 from tailgate.engine.passes import LEAST
@@ -49,7 +50,9 @@ class CudaProgram(Program):
 
     def _compiled(self, layout: Layout, least: int) -> tuple[str, dict[str, int], int, Any]:
         text, size, room, self.by_value = text_of(layout, len(self.arrays), least)
-        return text, size, room, Code(text, self.card)
+        code = Code(text, self.card)
+        self.kernels = code.kernels
+        return text, size, room, code
 
     def rows(self, episodes: int) -> DeviceState:
         """Return a state of so many episodes."""
@@ -65,14 +68,16 @@ class CudaProgram(Program):
         """Return the bytes that a row takes on the card: its state, and the arguments and results of some steps."""
         trace = self.trace
         arrays = [nodes for held in (trace.arguments, trace.results) for nodes in held.values()]
-        return self.stride / LANES + steps * sum(nodes.size * nodes.flat[0].dtype.itemsize for nodes in arrays if nodes.size)
+        each = sum(int(nodes.size) * int(nodes.flat[0].dtype.itemsize) for nodes in arrays if nodes.size)
+        return float(self.stride / LANES + steps * each)
 
     def check(self, field: str, episodes: int, steps: int = 1) -> None:
         """Raise DeviceError if the card has no memory for so many rows."""
         free = SPARE * self.card.free() - self.flights(episodes) * self.room
         most = max(0, int(free / self.bytes_of_row(steps)))
         if episodes > most:
-            raise DeviceError(field, episodes, f"at most {most:,} rows, which fit in the free memory of {self.card.name}; play in smaller batches")
+            wanted = f"at most {most:,} rows, which fit in the free memory of {self.card.name}; play in smaller batches"
+            raise DeviceError(field, episodes, wanted)
 
     def flights(self, episodes: int) -> int:
         """Return how many warps play so many episodes: those that run at once where each needs room for buffers, else all."""
@@ -80,7 +85,7 @@ class CudaProgram(Program):
         if not self.room:
             return blocks
         fit = int(self.card.free() * SHARE / self.room)
-        return max(1, min(blocks, fit, max(self.card.at_once(kernel, THREADS) for kernel in self.function.kernels.values())))
+        return max(1, min(blocks, fit, max(self.card.at_once(kernel, THREADS) for kernel in self.kernels.values())))
 
 
 class DeviceState(State):
@@ -121,7 +126,7 @@ class DeviceCall(Call):
     ) -> None:
         super().__init__(program, state, steps, values, 1, like)
         assert isinstance(state, DeviceState)
-        self.card, self._place = program.card, state
+        self.card, self._rows = program.card, state
         self._sent: Array | None = None
         episodes = state.episodes
         flights = program.flights(episodes)
@@ -133,7 +138,7 @@ class DeviceCall(Call):
         self._results: Memory | None = None
         self.arguments_at: dict[str, int] = {}
         self.sheet_at = 0
-        self._arguments = like._arguments if isinstance(like, DeviceCall) else self._taken(program, episodes)
+        self._arguments: dict[str, Memory] = like._arguments if isinstance(like, DeviceCall) else self._taken(program, episodes)
         self._by_value = np.zeros(max(1, len(program.by_value)) + 2 * max(1, len(program.arrays)), np.uint64)
         self._begun = 0  # the step of the sheet with which `play` continues
 
@@ -162,9 +167,9 @@ class DeviceCall(Call):
     def play(self, steps: int) -> None:
         """Play steps into the last sheet; the next call continues there."""
         self._send()
-        on, state, program = self.card, self._place, self.program
+        on, state, program = self.card, self._rows, self.program
         assert isinstance(program, CudaProgram)
-        kernel = program.function.kernels[KERNELS[self.steps > 1]]
+        kernel = program.kernels[KERNELS[self.steps > 1]]
         arguments = (state.held.at, self._tables.at, self._room.at, 0, state.blocks, self._begun, steps, self._broken.at, self._by_value)
         on.launch(kernel, self._grid, THREADS, arguments)
         self.broken = self._failed()
@@ -228,7 +233,7 @@ def _memory(program: CudaProgram, size: int, episodes: int) -> Memory:
 
 def _whole(at: int, size: int) -> Array:
     """Return the memory of this machine at an address."""
-    return np.frombuffer((ctypes.c_char * size).from_address(at), np.uint8)
+    return np.ctypeslib.as_array((ctypes.c_uint8 * size).from_address(at))
 
 
 def program_class(device: str) -> type[Program]:

@@ -23,7 +23,7 @@ def check_cells(cells: Sequence[Cell], workers: int = 1) -> None:
         raise InputError("workers", workers, f"1 with the device {here}: one process plays on a card")
     known: set[tuple[str, str, str]] = set()
     for cell in cells:
-        attack, defence = Spec("attack", cell.attack), Spec("defence", cell.defence)
+        attack = Spec("attack", cell.attack)
         made = attack.make()
         place = cell.place(made, attack.entry.knowledge)
         key = (cell.scenario, cell.defence, place.threat_model.knowledge)
