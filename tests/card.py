@@ -61,6 +61,16 @@ class HostCard:
     def at_once(self, kernel: Any, threads: int) -> int:
         return self.warps
 
+    def facts(self, kernel: Any) -> dict[str, int]:
+        return {"registers": 0, "local": 0}
+
+    def wait(self) -> None: ...
+
+    def copy(self, to: int, at: int, size: int) -> None:
+        self._inside(to, size)
+        self._inside(at, size)
+        ctypes.memmove(to, at, size)
+
     def launch(self, kernel: Any, grid: int, threads: int, arguments: Sequence[Any]) -> None:
         self.launches += 1
         values = [kind(value) for kind, value in zip(_KINDS, arguments, strict=False)]

@@ -32,6 +32,11 @@ class Attributes(enum.IntEnum):
     CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MINOR = 76
 
 
+class Functions(enum.IntEnum):
+    CU_FUNC_ATTRIBUTE_LOCAL_SIZE_BYTES = 3
+    CU_FUNC_ATTRIBUTE_NUM_REGS = 4
+
+
 class Plan:
     """A copy of rows; what is not set is zero."""
 
@@ -49,7 +54,7 @@ class Driver(types.SimpleNamespace):
     """`cuda.bindings.driver` of a machine."""
 
     def __init__(self, card: HostCard, version: int = 13010, begin: Code = Code.CUDA_SUCCESS, capability: tuple[int, int] = (9, 0)) -> None:
-        super().__init__(CUresult=Code, CUmemorytype=Kinds, CUdevice_attribute=Attributes, CUDA_MEMCPY2D=Plan)
+        super().__init__(CUresult=Code, CUmemorytype=Kinds, CUdevice_attribute=Attributes, CUfunction_attribute=Functions, CUDA_MEMCPY2D=Plan)
         self.card, self.version, self.begin, self.capability = card, version, begin, capability
         self.current: Any = None
         self.streams: set[int] = set()
@@ -111,6 +116,13 @@ class Driver(types.SimpleNamespace):
         for row in range(plan.Height):
             part = _array(host + row * held, plan.WidthInBytes)
             (self.card.send(at + row * pitch, part) if send else self.card.fetch(part, at + row * pitch))
+        return (Code(0),)
+
+    def cuFuncGetAttribute(self, what: Functions, kernel: Any) -> tuple[Code, int]:
+        return Code(0), {Functions(3): 40, Functions(4): 128}[what]
+
+    def cuMemcpyDtoDAsync(self, to: int, at: int, size: int, stream: int) -> tuple[Code]:
+        self.card.copy(to, at, size)
         return (Code(0),)
 
     def cuStreamSynchronize(self, stream: int) -> tuple[Code]:

@@ -44,6 +44,15 @@ class Card(Protocol):
     def at_once(self, kernel: Any, threads: int) -> int:
         """Return how many warps of a kernel run at once, in blocks of so many threads."""
 
+    def facts(self, kernel: Any) -> dict[str, int]:
+        """Return a kernel's `registers`, and the bytes of a thread's `local` memory, spilled registers among them."""
+
+    def wait(self) -> None:
+        """Return when all work is done."""
+
+    def copy(self, to: int, at: int, size: int) -> None:
+        """Begin a copy from one place on the card to another."""
+
     def launch(self, kernel: Any, grid: int, threads: int, arguments: Sequence[Argument]) -> None:
         """Begin a kernel; it runs after all work before it."""
 

@@ -121,6 +121,23 @@ class Nvidia:
         blocks = int(_ok(driver.cuOccupancyMaxActiveBlocksPerMultiprocessor(kernel, threads, 0)))
         return max(1, self._processors * blocks * threads // 32)
 
+    def facts(self, kernel: Any) -> dict[str, int]:
+        """Return a kernel's `registers`, and the bytes of a thread's `local` memory, spilled registers among them."""
+        self._here()
+        part = driver.CUfunction_attribute
+        asked = {"registers": part.CU_FUNC_ATTRIBUTE_NUM_REGS, "local": part.CU_FUNC_ATTRIBUTE_LOCAL_SIZE_BYTES}
+        return {name: int(_ok(driver.cuFuncGetAttribute(what, kernel))) for name, what in asked.items()}
+
+    def copy(self, to: int, at: int, size: int) -> None:
+        """Begin a copy from one place on the card to another."""
+        self._here()
+        _ok(driver.cuMemcpyDtoDAsync(to, at, size, self.stream))
+
+    def wait(self) -> None:
+        """Return when all work is done."""
+        self._here()
+        self._wait()
+
     def launch(self, kernel: Any, grid: int, threads: int, arguments: Sequence[Argument]) -> None:
         """Begin a kernel; it runs after all work before it."""
         self._here()

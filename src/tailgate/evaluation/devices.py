@@ -11,6 +11,7 @@ from tailgate.engine.agreement import Untraced
 from tailgate.engine.cards import DeviceError, device, playing_on
 
 if TYPE_CHECKING:
+    from tailgate.core.loop import Loop
     from tailgate.evaluation.cells import Cell
 
 
@@ -34,15 +35,20 @@ def check_cells(cells: Sequence[Cell], workers: int = 1) -> None:
             raise DeviceError("device", here, f"cpu for {cell.defence} in {cell.scenario}: {why}")
 
 
-def _opaque(cell: Cell, attack: object) -> str:
-    """Return why the loop of a cell cannot be traced, or nothing. This processor's code is made in little time, and of the same trace."""
+def untraced(loop: Loop) -> str:
+    """Return why a loop cannot be traced, or nothing. This processor's code is made in little time, and of the same trace."""
     from tailgate.play.commanded import commanded
 
+    with playing_on("cpu"):
+        found = commanded(loop)
+    return found.why if isinstance(found, Untraced) else ""
+
+
+def _opaque(cell: Cell, attack: object) -> str:
+    """Return why the loop of a cell cannot be traced, or nothing."""
     defence, spec = Spec("defence", cell.defence), Spec("attack", cell.attack)
     try:
         loop = cell.place(attack, spec.entry.knowledge).loop(defence.make(), defence.entry.uses)  # type: ignore[arg-type]
     except (NotApplicable, InputError):
         return ""  # its rows say so
-    with playing_on("cpu"):
-        found = commanded(loop)
-    return found.why if isinstance(found, Untraced) else ""
+    return untraced(loop)
