@@ -28,7 +28,7 @@ from tailgate.engine.llvm import Column, Held, Layout
 from tailgate.engine.passes import Branch, Item, counted, schedule
 
 THREADS = 128  # of a block of the grid
-BY_VALUE = 400  # shared numbers among a kernel's arguments, which may take 4 KiB; the others stand in the tables
+ARGUMENTS = 4000  # bytes of a kernel's arguments; shared numbers that find no room there stand in the tables
 INLINED = 4000  # most nodes of routines that are repeated at each use
 KERNELS = ("play_step", "play_steps")
 
@@ -48,6 +48,7 @@ class Emitter:
         self.scalars: dict[int, int] = {}  # slot of a shared number -> its place among the arguments
         self.names: dict[int | tuple[int, str], str] = {}
         self.count = 0
+        self.by_value = 0  # most shared numbers among the arguments
         self.kept = False  # the state is in variables
 
     def fresh(self) -> Emitter:
@@ -100,7 +101,7 @@ class Emitter:
                 self.layout.uniforms[node.id] = len(self.layout.slots)
                 self.layout.slots.append(node)
             slot = self.layout.uniforms[node.id]
-            if slot not in self.scalars and len(self.scalars) < BY_VALUE:
+            if slot not in self.scalars and len(self.scalars) < self.by_value:
                 self.scalars[slot] = len(self.scalars)
             held = f"u.at[{self.scalars[slot]}]" if slot in self.scalars else f"__ldg(tables + {slot})"
             self.names[node.id] = shared(held, node.dtype)
@@ -203,6 +204,7 @@ def text_of(layout: Layout, arrays: int, least: int) -> tuple[str, dict[str, int
     items = schedule([node for node, _ in layout.outputs], least)
     e = Emitter(layout)
     e.inline = cuda_parts.repeated(items) <= INLINED
+    e.by_value = max(1, (ARGUMENTS - 8 * 8 - 16 * arrays) // 8)
     places, room = _rooms(e, items)
     kernels = [_kernel(e, name, items, places, room) for name in KERNELS]
     arguments = f"struct Shared {{ u64 at[{max(1, len(e.scalars))}]; Array array[{max(1, arrays)}]; }};"
@@ -228,6 +230,7 @@ def _kernel(outer: Emitter, name: str, items: Sequence[Item], places: dict[int, 
     """Return the text of one kernel."""
     e, layout = outer.fresh(), outer.layout
     e.layout, e.scalars, e.places, e.merged, e.kept = layout, outer.scalars, places, outer.merged, name == KERNELS[1]
+    e.by_value = outer.by_value
     e.line(f"const int lane = threadIdx.x & {LANES - 1};")
     e.line("const i64 warps = (i64)gridDim.x * blockDim.x / 32, warp = ((i64)blockIdx.x * blockDim.x + threadIdx.x) / 32;")
     for size in sorted({node.dtype.itemsize for item in items for node in sweeps.inside(item) if node.id in places}):
