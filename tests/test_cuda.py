@@ -112,13 +112,19 @@ def test_trust(host_card: HostCard) -> None:
     assert found == wanted
 
 
+LEARNERS = {"cem": "cem={population: 4, episodes: 2, elite: 0.5}", "ppo": "ppo={envs: 8, rollout: 16, batch_size: 64, epochs: 1}"}
+
+
 @needs_compiler
-def test_a_training_ends_in_the_same_policy(host_card: HostCard, tmp_path: Any) -> None:
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_a_training_ends_in_the_same_policy(learner: str, host_card: HostCard, tmp_path: Any) -> None:
     from tailgate.training.train import load_config, train
 
+    if learner != "cem":
+        pytest.importorskip("stable_baselines3")
     made = {}
     for device in ("cpu", "cuda"):
-        words = [f"out={tmp_path / device}", "name=one", "learner=cem", "steps=2000", "cem={population: 4, episodes: 2, elite: 0.5}", "seeds=1", "tensorboard=false"]
+        words = [f"out={tmp_path / device}", "name=one", f"learner={learner}", "steps=1500", LEARNERS[learner], "seeds=1", "tensorboard=false"]
         before = host_card.launches
         (path,) = train(load_config("gusty", [*words, f"device={device}"]), lambda seed, now: None)
         assert (host_card.launches > before) == (device == "cuda")
@@ -196,6 +202,18 @@ def test_code_is_compiled_once(nvidia: Any, tmp_path: Any, monkeypatch: pytest.M
     assert compiled(capability=(8, 0)) == 2 and compiled(version=(13, 1)) == 2 and compiled() == 0
     monkeypatch.setattr(on_device, "VERSION", "other")
     assert compiled() == 2
+
+
+@needs_compiler
+def test_the_bound_on_registers(host_card: HostCard, monkeypatch: pytest.MonkeyPatch) -> None:
+    from tailgate.envs.gym.programs import SeatPrograms
+
+    seat = Seat.make(**FOLLOWING)
+    monkeypatch.setenv("TAILGATE_CUDA_BLOCKS", "3")
+    assert SeatPrograms(seat, device="cuda").decide.text.count("__launch_bounds__(128, 3)") == 2
+    monkeypatch.setenv("TAILGATE_CUDA_BLOCKS", "many")
+    with pytest.raises(InputError, match="TAILGATE_CUDA_BLOCKS: got 'many'"):
+        SeatPrograms(seat, device="cuda")
 
 
 def test_an_error_of_the_compiler_has_its_log(nvidia: Any) -> None:

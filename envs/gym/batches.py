@@ -37,7 +37,7 @@ class Episodes(Protocol):
     device: str
 
     def check(self, batch: int) -> None:
-        """Raise InputError if the device has no memory for so many rows."""
+        """Raise InputError if the device has no memory for these rows."""
 
     @property
     def number(self) -> Array:

@@ -20,7 +20,7 @@ from tailgate.core import draws
 from tailgate.engine.agreement import Untraced, same
 from tailgate.engine.cards import Card, Memory, card
 from tailgate.engine.cuda import KERNELS
-from tailgate.engine.on_device import CudaProgram, DeviceCall
+from tailgate.engine.on_device import CudaProgram, DeviceCall, bound
 from tailgate.engine.program import Call
 from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.envs.gym.programs import Rows, SeatPrograms, programs_of
@@ -34,7 +34,7 @@ COPIED = 1 << 30  # bytes of the copy that measures the memory
 
 
 class Plant(NamedTuple):
-    """What is measured: a scenario, a defence, and the rows, fewer where a card has no room for them."""
+    """A scenario, a defence, and the rows, fewer where a card has no room for them."""
 
     scenario: str
     defence: str
@@ -177,7 +177,7 @@ def bench(only: Sequence[str] | None = None, rounds: int = 7, seconds: float = 0
     said("done")
     return {
         "format": FORMAT, "version": VERSION, "commit": commit(), "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "card": {"name": on.name, "compiler": on.kind, "copy_bytes_per_second": copy}, "machine": machine(),
+        "card": {"name": on.name, "compiler": on.kind, "copy_bytes_per_second": copy, "blocks": bound()}, "machine": machine(),
         "equal": not any(check["arrays_that_differ"] for check in checks), "checks": checks, "lines": lines,
     }  # fmt: skip
 

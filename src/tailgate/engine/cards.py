@@ -24,11 +24,11 @@ class DeviceError(InputError):
 
 
 class OutOfMemory(Exception):
-    """The card has no room for so many bytes."""
+    """The card has no room for what was asked."""
 
 
 class Card(Protocol):
-    """A card, or what stands for one in tests. Addresses are the card's; copies wait for all work before them."""
+    """A card, or what takes its place in tests. Addresses are the card's; copies wait for all work before them."""
 
     name: str
     kind: str  # what compiled code depends on: the card's capability, the compiler and its options
@@ -42,7 +42,7 @@ class Card(Protocol):
         """Return the kernels of machine code."""
 
     def at_once(self, kernel: Any, threads: int) -> int:
-        """Return how many warps of a kernel run at once, in blocks of so many threads."""
+        """Return how many warps of a kernel run at once, in blocks of a number of threads."""
 
     def facts(self, kernel: Any) -> dict[str, int]:
         """Return a kernel's `registers`, and the bytes of a thread's `local` memory, spilled registers among them."""

@@ -199,14 +199,17 @@ def kind(node: Node) -> str:
     return "char*" if node.size else TYPES[code(node.dtype)]
 
 
-def text_of(layout: Layout, arrays: int, least: int) -> tuple[str, dict[str, int], int, list[int]]:
-    """Return the text of both kernels, its numbers of nodes and branches, the bytes of a warp's buffers, and the slots passed by value."""
+def text_of(layout: Layout, arrays: int, least: int, blocks: int = 0) -> tuple[str, dict[str, int], int, list[int]]:
+    """Return the text of both kernels, its numbers of nodes and branches, the bytes of a warp's buffers, and the slots passed by value.
+
+    With `blocks` the compiler leaves room for that number of blocks on a multiprocessor: fewer registers, more threads.
+    """
     items = schedule([node for node, _ in layout.outputs], least)
     e = Emitter(layout)
     e.inline = cuda_parts.repeated(items) <= INLINED
     e.by_value = max(1, (ARGUMENTS - 8 * 8 - 16 * arrays) // 8)
     places, room = _rooms(e, items)
-    kernels = [_kernel(e, name, items, places, room) for name in KERNELS]
+    kernels = [_kernel(e, name, items, places, room, blocks) for name in KERNELS]
     arguments = f"struct Shared {{ u64 at[{max(1, len(e.scalars))}]; Array array[{max(1, arrays)}]; }};"
     return "\n".join([HEAD, arguments, *e.texts, *kernels, ""]), counted(items), room, list(e.scalars)
 
@@ -226,7 +229,7 @@ def _rooms(e: Emitter, items: Sequence[Item]) -> tuple[dict[int, int], int]:
     return places, total
 
 
-def _kernel(outer: Emitter, name: str, items: Sequence[Item], places: dict[int, int], room: int) -> str:
+def _kernel(outer: Emitter, name: str, items: Sequence[Item], places: dict[int, int], room: int, blocks: int) -> str:
     """Return the text of one kernel."""
     e, layout = outer.fresh(), outer.layout
     e.layout, e.scalars, e.places, e.merged, e.kept = layout, outer.scalars, places, outer.merged, name == KERNELS[1]
@@ -250,7 +253,8 @@ def _kernel(outer: Emitter, name: str, items: Sequence[Item], places: dict[int, 
             for at in dict.fromkeys(place.offset for _, place in layout.outputs if isinstance(place, Held) and place.offset in held):
                 e.line(f"{saved(f'(state{held[at].itemsize} + {at})', held[at])} = s{at};")
     given = "char* memory, const u64* __restrict__ tables, char* large, i64 first, i64 last, i64 begin, i64 steps, i64* broken, Shared u"
-    head = f'extern "C" __global__ void __launch_bounds__({THREADS}) {name}({given}) {{'
+    bounds = f"{THREADS}, {blocks}" if blocks else f"{THREADS}"
+    head = f'extern "C" __global__ void __launch_bounds__({bounds}) {name}({given}) {{'
     return "\n".join([head, *([] if e.kept else ["  const i64 time = begin;"]), *e.lines, "}"])
 
 

@@ -150,7 +150,7 @@ class Nvidia:
         self._here()
         at = int(_ok(driver.cuMemAlloc(size)))
         _ok(driver.cuMemsetD8Async(at, 0, size, self.stream))
-        self._wait()  # whoever uses it may queue work elsewhere
+        self._wait()  # its user may queue work elsewhere
         return at
 
     def given_back(self, at: int) -> None:

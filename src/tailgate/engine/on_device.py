@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import os
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from tailgate.base.errors import InputError
 from tailgate.engine import objects
 from tailgate.engine.cards import Card, DeviceError, Memory, OutOfMemory, card
 from tailgate.engine.cuda import KERNELS, THREADS, text_of
@@ -24,6 +26,14 @@ from tailgate.engine.program import Call, Program, State, Trace
 VERSION = "1"  # of this module's translation
 SPARE = 0.95  # of the free memory that rows may take
 SHARE = 0.5  # of the free memory that buffers may take
+
+
+def bound() -> int:
+    """Return how many blocks of threads a multiprocessor has to hold: TAILGATE_CUDA_BLOCKS, or 0 for no bound. No bit changes."""
+    asked = os.environ.get("TAILGATE_CUDA_BLOCKS", "0")
+    if asked not in [str(n) for n in range(9)]:
+        raise InputError("TAILGATE_CUDA_BLOCKS", asked, "a whole number from 0 to 8")
+    return int(asked)
 
 
 class Code:
@@ -49,13 +59,13 @@ class CudaProgram(Program):
         super().__init__(trace, LANES, least, twins)
 
     def _compiled(self, layout: Layout, least: int) -> tuple[str, dict[str, int], int, Any]:
-        text, size, room, self.by_value = text_of(layout, len(self.arrays), least)
+        text, size, room, self.by_value = text_of(layout, len(self.arrays), least, bound())
         code = Code(text, self.card)
         self.kernels = code.kernels
         return text, size, room, code
 
     def rows(self, episodes: int) -> DeviceState:
-        """Return a state of so many episodes."""
+        """Return a state of some episodes."""
         return DeviceState(self, episodes)
 
     def call(
@@ -72,7 +82,7 @@ class CudaProgram(Program):
         return float(self.stride / LANES + steps * each)
 
     def check(self, field: str, episodes: int, steps: int = 1) -> None:
-        """Raise DeviceError if the card has no memory for so many rows."""
+        """Raise DeviceError if the card has no memory for these rows."""
         free = SPARE * self.card.free() - self.flights(episodes) * self.room
         most = max(0, int(free / self.bytes_of_row(steps)))
         if episodes > most:
@@ -80,7 +90,7 @@ class CudaProgram(Program):
             raise DeviceError(field, episodes, wanted)
 
     def flights(self, episodes: int) -> int:
-        """Return how many warps play so many episodes: those that run at once where each needs room for buffers, else all."""
+        """Return how many warps play these episodes: those that run at once where each needs room for buffers, else all."""
         blocks = -(-episodes // LANES)
         if not self.room:
             return blocks

@@ -147,11 +147,11 @@ class Program:
         return text, size, room, objects.Function(text)
 
     def rows(self, episodes: int) -> State:
-        """Return a state of so many episodes."""
+        """Return a state of some episodes."""
         return State(self, episodes)
 
     def check(self, field: str, episodes: int, steps: int = 1) -> None:
-        """Raise InputError for `field` if the program's device has no memory for so many episodes."""
+        """Raise InputError for `field` if the program's device has no memory for these episodes."""
 
     def call(
         self, state: State, steps: int = 1, values: Sequence[Array] | None = None, threads: int = 1, like: Call | None = None

@@ -88,6 +88,11 @@ def spent(path: Path) -> float:
 
 
 def _train(training: Training, report: Callable[[Progress], None]) -> Path:
+    with playing_on(training.config.device or "cpu"):
+        return _trained(training, report)
+
+
+def _trained(training: Training, report: Callable[[Progress], None]) -> Path:
     config, seed, resume, settings, environment, teacher = training
     module, directory = learner_of(config.learner), config.directory
     board = directory / "tensorboard" if config.tensorboard else None
@@ -96,7 +101,7 @@ def _train(training: Training, report: Callable[[Progress], None]) -> Path:
     record = directory / f"curve-{seed}.json"
     before = spent(record) if resume and record.is_file() else 0.0
     started = time.process_time()  # of this process alone: others on the machine do not count
-    with _apart(config.defence), playing_on(config.device or "cpu"):
+    with _apart(config.defence):
         if resume and checkpoint.exists():
             learner.load(checkpoint)
         elif teacher is not None:
