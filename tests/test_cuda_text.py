@@ -97,8 +97,8 @@ def test_environments(arguments: dict[str, Any], tmp_path: Any) -> None:
 EPISODES = [
     ("gusty-stop-and-go-v0", "chi2_kf", "fdi_ramp:start_step=20,rate=0.3", True),
     ("platoon-gusty-v0", "dkf", "fdi:start_step=20,value=30", True),
-    ("network-noisy-v0", "dkf", "none", False),
-    ("radar-following-v0", "cra", "dos_jam:start_step=30,low=-3,high=3", True),
+    ("radar-following-v0", "cra", "dos_jam:start_step=30,low=-3,high=3", False),
+    ("network-noisy-v0", "dkf", "none", True),
     ("platoon-gusty-v0", "lasso_dkf", "dropout:start_step=30,probability=0.5", False),
     ("platoon-20-v0", "saturated_dkf", "fdi:start_step=20,value=-50", True),
 ]

@@ -60,6 +60,7 @@ class Rollout:
     def play(self, keys: Keys, terminate: bool) -> tuple[Array, dict[str, Array], dict[str, Array]]:
         """Play episodes; return lengths (B,), signals (K, B, ...) and the road before the first step, as `Trace` holds them."""
         loop, batch, begun = self.loop, len(keys.key), self.begun(keys)
+        self.program.check("batch", batch, loop.horizon)
         first = loop.plant.scene(loop.plan.plant, begun.loop.plant)._asdict()
         state = self.program.rows(batch)
         state.put(begun)
