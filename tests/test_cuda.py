@@ -207,7 +207,11 @@ def test_code_is_compiled_once(nvidia: Any, tmp_path: Any, monkeypatch: pytest.M
 
     def compiled(times: float = 2.0, **machine: Any) -> int:
         _, compiler = nvidia(**machine)
-        on_device.CudaProgram(traced(lambda held, _: ({"x": times * held["x"]}, {}), {"x": np.ones(1)}, {}))
+        made = on_device.CudaProgram(traced(lambda held, _: ({"x": times * held["x"]}, {}), {"x": np.ones(1)}, {}))
+        assert compiler.compiled == 0  # nobody has asked for a kernel
+        rows = made.rows(2)
+        rows.put({"x": np.ones(2)})
+        made.call(rows)()
         return int(compiler.compiled)
 
     assert compiled() == 1 and compiled() == 0 and compiled(times=3.0) == 1

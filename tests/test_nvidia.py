@@ -41,7 +41,7 @@ for _ in range(20):
     actions = chance.integers(0, 2, 40)
     for first, second in zip(one.step(actions)[:4], two.step(actions)[:4], strict=True):
         assert np.array_equal(first, second)
-kernel = one.episodes.programs.decide.kernels["play_step"]
+kernel = one.episodes.programs.decide.code.kernel("play_step")
 print(cards.card().name, cards.card().facts(kernel), cards.card().at_once(kernel, 128))
 try:
     cards.Memory(cards.card(), 1 << 40)

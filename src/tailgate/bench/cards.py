@@ -19,7 +19,6 @@ from tailgate.base.version import VERSION
 from tailgate.core import draws
 from tailgate.engine.agreement import Untraced, same
 from tailgate.engine.cards import Card, Memory, card
-from tailgate.engine.cuda import KERNELS
 from tailgate.engine.on_device import CudaProgram, DeviceCall, bound
 from tailgate.engine.program import Call
 from tailgate.envs.gym.attacker_mdp import Seat
@@ -128,8 +127,8 @@ class Flight:
         program = call.program
         assert isinstance(program, CudaProgram)
         moved = 2.0 * program.stride / 32 / call.steps + program.bytes_of_row(1) - program.stride / 32
-        kernel = program.kernels[KERNELS[call.steps > 1]]
-        return self.card.facts(kernel) | {"buffers": program.room // 32, "bytes_of_a_step": round(moved, 1), **program.size}
+        facts = self.card.facts(program.code.kernel(call.kernel))
+        return facts | {"buffers": program.room // 32, "bytes_of_a_step": round(moved, 1), **program.size}
 
 
 def _on_card(call: Call) -> DeviceCall:

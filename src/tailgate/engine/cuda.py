@@ -4,7 +4,7 @@ A block of the state is a warp: its numbers lie lane by lane, so that the thread
 A branch is a branch, a sweep a loop, a buffer an address; a choice between buffers exchanges addresses.
 Code must be compiled without contraction (--fmad=false) and with exact division and square roots, which are the default.
 
-The text has two kernels of the same step.
+The text has two kernels of the same step, or one of them where ONLY is defined as its number.
 `play_step` plays one, with the state in memory; `play_steps` plays several, with the state in variables.
 Both take these arguments:
 
@@ -211,7 +211,13 @@ def text_of(layout: Layout, arrays: int, least: int, blocks: int = 0) -> tuple[s
     places, room = _rooms(e, items)
     kernels = [_kernel(e, name, items, places, room, blocks) for name in KERNELS]
     arguments = f"struct Shared {{ u64 at[{max(1, len(e.scalars))}]; Array array[{max(1, arrays)}]; }};"
-    return "\n".join([HEAD, arguments, *e.texts, *kernels, ""]), counted(items), room, list(e.scalars)
+    parts = [f"#if !defined(ONLY) || ONLY == {i}\n{kernel}\n#endif" for i, kernel in enumerate(kernels)]
+    return "\n".join([HEAD, arguments, *e.texts, *parts, ""]), counted(items), room, list(e.scalars)
+
+
+def only(kernel: str, text: str) -> str:
+    """Return a text with one of its kernels."""
+    return f"#define ONLY {KERNELS.index(kernel)}\n{text}"
 
 
 def _rooms(e: Emitter, items: Sequence[Item]) -> tuple[dict[int, int], int]:

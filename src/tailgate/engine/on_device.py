@@ -16,7 +16,7 @@ import numpy as np
 from tailgate.base.errors import InputError
 from tailgate.engine import objects
 from tailgate.engine.cards import Card, DeviceError, Memory, OutOfMemory, card
-from tailgate.engine.cuda import KERNELS, THREADS, text_of
+from tailgate.engine.cuda import KERNELS, THREADS, only, text_of
 from tailgate.engine.cuda_parts import LANES
 from tailgate.engine.llvm import Layout
 from tailgate.engine.operations import Array
@@ -37,17 +37,24 @@ def bound() -> int:
 
 
 class Code:
-    """The kernels of a text, compiled for a card or loaded from the folder of `objects`."""
+    """The kernels of a text, each compiled for a card when it is first asked for, or loaded from the folder of `objects`."""
 
     def __init__(self, text: str, on: Card) -> None:
-        key = "\0".join((VERSION, on.kind, text))
-        self.name = hashlib.sha256(key.encode()).hexdigest() + ".cubin"
-        held = objects.kept(self.name)
-        self.fresh = held is None
-        if held is None:
-            held = on.compiled(text)
-            objects.keep(self.name, held)
-        self.kernels = on.loaded(held, KERNELS)
+        self._text, self._card = text, on
+        self._digest = hashlib.sha256("\0".join((VERSION, on.kind, text)).encode()).hexdigest()
+        self.name = f"{self._digest}.cubin"
+        self._kernels: dict[str, Any] = {}
+
+    def kernel(self, name: str) -> Any:
+        """Return a kernel by name."""
+        if name not in self._kernels:
+            place = f"{self._digest}-{name}.cubin"
+            held = objects.kept(place)
+            if held is None:
+                held = self._card.compiled(only(name, self._text))
+                objects.keep(place, held)
+            self._kernels |= self._card.loaded(held, [name])
+        return self._kernels[name]
 
 
 class CudaProgram(Program):
@@ -60,9 +67,8 @@ class CudaProgram(Program):
 
     def _compiled(self, layout: Layout, least: int) -> tuple[str, dict[str, int], int, Any]:
         text, size, room, self.by_value = text_of(layout, len(self.arrays), least, bound())
-        code = Code(text, self.card)
-        self.kernels = code.kernels
-        return text, size, room, code
+        self.code = Code(text, self.card)
+        return text, size, room, self.code
 
     def rows(self, episodes: int) -> DeviceState:
         """Return a state of some episodes."""
@@ -83,19 +89,19 @@ class CudaProgram(Program):
 
     def check(self, field: str, episodes: int, steps: int = 1) -> None:
         """Raise DeviceError if the card has no memory for these rows."""
-        free = SPARE * self.card.free() - self.flights(episodes) * self.room
+        free = SPARE * self.card.free() - self.flights(episodes, KERNELS[steps > 1]) * self.room
         most = max(0, int(free / self.bytes_of_row(steps)))
         if episodes > most:
             wanted = f"at most {most:,} rows, which fit in the free memory of {self.card.name}; play in smaller batches"
             raise DeviceError(field, episodes, wanted)
 
-    def flights(self, episodes: int) -> int:
+    def flights(self, episodes: int, kernel: str = KERNELS[0]) -> int:
         """Return how many warps play these episodes: those that run at once where each needs room for buffers, else all."""
         blocks = -(-episodes // LANES)
         if not self.room:
             return blocks
         fit = int(self.card.free() * SHARE / self.room)
-        return max(1, min(blocks, fit, max(self.card.at_once(kernel, THREADS) for kernel in self.kernels.values())))
+        return max(1, min(blocks, fit, self.card.at_once(self.code.kernel(kernel), THREADS)))
 
 
 class DeviceState(State):
@@ -139,7 +145,8 @@ class DeviceCall(Call):
         self.card, self._rows = program.card, state
         self._sent: Array | None = None
         episodes = state.episodes
-        flights = program.flights(episodes)
+        self.kernel = KERNELS[steps > 1]
+        flights = program.flights(episodes, self.kernel)
         self._grid = -(-flights * LANES // THREADS)
         warps = self._grid * THREADS // LANES
         self._room = _memory(program, warps * program.room, episodes)
@@ -179,7 +186,7 @@ class DeviceCall(Call):
         self._send()
         on, state, program = self.card, self._rows, self.program
         assert isinstance(program, CudaProgram)
-        kernel = program.kernels[KERNELS[self.steps > 1]]
+        kernel = program.code.kernel(self.kernel)
         arguments = (state.held.at, self._tables.at, self._room.at, 0, state.blocks, self._begun, steps, self._broken.at, self._by_value)
         on.launch(kernel, self._grid, THREADS, arguments)
         self.broken = self._failed()

@@ -124,9 +124,12 @@ def _difference(rollout: Rollout, batch: int = ROWS) -> str:
     plain = rollout.begun(draws.keys("tune", range(batch)))
     state = rollout.program.rows(batch)
     state.put(plain)
-    call = rollout.program.call(state)
+    call = rollout.program.call(state, 2)  # the form that plays: several steps, of which each is one
     for step in range(min(TRIED, rollout.loop.horizon)):
-        results, found = call(), raised(lambda: rollout.plain(plain))  # noqa: B023
+        call.begin()
+        call.play(1)
+        results = {name: value[0] for name, value in call.results().items()}
+        found = raised(lambda: rollout.plain(plain))  # noqa: B023
         if isinstance(found, str):
             return "" if not results["demands"].all() else f"step {step + 1}: {found}"
         plain, wanted = found
