@@ -8,16 +8,22 @@ import pytest
 
 from tailgate.core import draws
 from tailgate.engine.cards import playing_on
+from tailgate.engine.evaluation import evaluate
+from tailgate.engine.graph import Graph
 from tailgate.engine.on_device import CudaProgram
+from tailgate.engine.operations import BINARY, BOOL, COMPARISONS, DTYPES, UNARY
+from tailgate.engine.program import Trace as Nodes
 from tailgate.engine.program import traced
 from tailgate.play.commanded import commanded
 from tailgate.play.rollouts import Rollout, rollout_of
 from tailgate.play.trace import Trace, rollout
 
+from . import test_engine_arrays as arrays
 from . import test_engine_buffers as buffers
-from .card import host_card, needs_compiler
+from .card import HostCard, host_card, needs_compiler
 from .engines import as_plain, loop_of
 from .test_engine import as_numpy, numbers, random_trace
+from .test_engine import same as alike
 
 __all__ = ["host_card"]
 pytestmark = [needs_compiler, pytest.mark.usefixtures("host_card")]
@@ -33,9 +39,68 @@ def test_random_graphs(seed: int) -> None:
     as_numpy(program, uniforms, shapes, 1, {node.attr: numbers(chance, node.dtype, 1)[0] for node in uniforms}, chance)
 
 
-@pytest.mark.thin(4)
-@pytest.mark.parametrize("name", buffers.CASES)
-def test_buffers(name: str) -> None:
+def test_every_operation() -> None:
+    """On odd numbers of every type: with each other, with a constant, and with a number that all episodes share."""
+    graph, chance, batch = Graph(), np.random.default_rng(4), 300
+    inputs, results, given = {}, {}, {}
+    for dtype in DTYPES:
+        key = dtype.str[1:]
+        nodes = [graph.input(("arguments", key, i), dtype) for i in range(2)]
+        inputs[key] = np.array([nodes], object)
+        given |= {node.attr: numbers(chance, dtype, batch) for node in nodes}
+        seven = graph.uniform(f"u{key}", np.array(7 if dtype.kind in "iu" else 1).astype(dtype))
+        others = [nodes[1], graph.const(3 if dtype.kind in "iu" else 1, dtype), seven]
+        made = [graph.unary(op, nodes[0]) for op in UNARY if _fits(op, dtype)]
+        for other in others:
+            made += [graph.binary(op, *pair) for op in (*BINARY, *COMPARISONS) for pair in ((nodes[0], other), (other, nodes[0])) if _fits(op, dtype, pair[1])]
+            made.append(graph.select(graph.input(("arguments", "b1", 0), BOOL), nodes[0], other))
+        made += [graph.cast(nodes[0], to) for to in DTYPES]
+        for i, node in enumerate(made):
+            results[f"{key} {i} {node.op}"] = np.array([[node]], object)
+    program = CudaProgram(Nodes(graph, {}, inputs, results, None))
+    call = program.call(program.rows(batch))
+    for key, nodes in inputs.items():
+        for i, node in enumerate(nodes[0]):
+            call.arguments[key][:, i] = given[node.attr]
+    got = call()
+    for name, nodes in results.items():
+        (wanted,) = evaluate(graph, [nodes[0, 0]], given)
+        assert alike(got[name][:, 0], np.asarray(wanted)), (name, nodes[0, 0])
+
+
+def _fits(op: str, dtype: np.dtype[Any], by: Any = None) -> bool:
+    """An operation is defined for a type; shifts and remainders are by constants."""
+    if op in ("sqrt", "floor", "ceil", "trunc", "rint", "div"):
+        return dtype.kind == "f"
+    if op in ("shl", "shr", "rem"):
+        return dtype.kind in "iu" and by is not None and by.op == "const"
+    if op in ("and", "or", "xor", "not"):
+        return dtype.kind in "biu"
+    return dtype != BOOL or op in COMPARISONS
+
+
+def test_numpys_functions() -> None:
+    """All of a component's language in one program: loops until convergence, tables, rings, choices, reductions."""
+    given, batch = arrays.arrays(45), 45
+    with np.errstate(all="ignore"):
+        wanted = {name: np.asarray(function(**copy.deepcopy(given))) for name, function in arrays.CASES.items()}
+    trace = traced(
+        lambda _, held: ((), {name: function(**{k: held[k].copy() for k in held}) for name, function in arrays.CASES.items()}),
+        (), {k: v[:1] for k, v in given.items()},
+    )  # fmt: skip
+    program = CudaProgram(trace)
+    call = program.call(program.rows(batch))
+    for key, value in given.items():
+        call.arguments[key][...] = value
+    for name, got in call().items():
+        assert got.shape == wanted[name].shape and alike(got, wanted[name]), name
+
+
+OFTEN = ("elementwise", "types", "sparse", "dense", "inverses", "rare", "in a loop", "read in other places")
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[] if name in OFTEN else [pytest.mark.long]) for name in buffers.CASES])
+def test_buffers(name: str, host_card: HostCard) -> None:
     function, batch = buffers.CASES[name], 137  # more warps than run at once: they share their rooms
     given = buffers.state(batch)
     with np.errstate(all="ignore"):
@@ -44,8 +109,13 @@ def test_buffers(name: str) -> None:
     program = CudaProgram(trace)
     rows = program.rows(batch)
     rows.put(given)
-    got = program.call(rows)()["out"]
+    call = program.call(rows)
+    got = call()["out"]
     np.testing.assert_array_equal(buffers.bits(got), buffers.bits(wanted))
+    if program.room:  # each warp has its own
+        held = np.zeros(call._room.size, np.uint8)
+        host_card.fetch(held, call._room.at)
+        assert held.reshape(-1, program.room)[: host_card.warps].any(axis=1).all()
 
 
 @pytest.mark.parametrize("steps", [1, 5])

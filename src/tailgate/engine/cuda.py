@@ -290,13 +290,13 @@ def _step(e: Emitter, items: Sequence[Item]) -> None:
             rest.append((node, to))
     outer = dict(e.names)
     e.emit(items, waiting)
-    for node, to in sorted(rest, key=lambda pair: pair[0].size):  # buffers last
+    for node, to in rest:
         if not node.size:
             e.store(node, to)
     if layout.demands:
         e.line(f"if (!({' & '.join(e.value(node) for node in layout.demands)})) *broken = 1;")
     for node, to in rest:
-        if node.size:
+        if node.size:  # last: all that reads the place has been emitted
             assert isinstance(to, Held)
             cuda_parts.copy(e, e.value(node), f"(state{node.dtype.itemsize} + {to.offset})", node.dtype, node.size)
     e.names = outer
