@@ -21,7 +21,7 @@ from tailgate.play import commanded, rollouts
 
 HEADER = Path(__file__).with_name("cuda_on_host.h")
 COMPILER = next((found for name in ("g++", "c++", "clang++") if (found := shutil.which(name))), None)
-OPTIONS = ("-std=c++17", "-O1", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared", "-w")
+OPTIONS = ("-std=c++17", "-O1", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared", "-w", *os.environ.get("HOST_OPTIONS", "").split())
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler: CUDA's text cannot be compiled for this processor")
 _KINDS = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, *(ctypes.c_int64,) * 4, ctypes.c_void_p)
 

@@ -1,17 +1,23 @@
 """CUDA's text, compiled for this processor, gives the bits of numpy: random graphs, buffers, environments with restarts, whole episodes."""
 
 import copy
+import os
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from tailgate import num
 from tailgate.core import draws
 from tailgate.engine.cards import playing_on
 from tailgate.engine.evaluation import evaluate
 from tailgate.engine.graph import Graph
 from tailgate.engine.on_device import CudaProgram
 from tailgate.engine.operations import BINARY, BOOL, COMPARISONS, DTYPES, UNARY
+from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Trace as Nodes
 from tailgate.engine.program import traced
 from tailgate.play.commanded import commanded
@@ -94,6 +100,47 @@ def test_numpys_functions() -> None:
         call.arguments[key][...] = value
     for name, got in call().items():
         assert got.shape == wanted[name].shape and alike(got, wanted[name]), name
+
+
+def test_loops_products_and_shared_numbers() -> None:
+    """Rows stop in different rounds; a dense matrix that is not square; numbers that change between calls, in tables too."""
+    weights, batch = np.random.default_rng(1).normal(size=(7, 10)), 40
+    table = np.random.default_rng(2).normal(size=(300, 2))
+
+    def step(held: Any, scale: Any = 1.0, weights: Any = weights, table: Any = table) -> Any:
+        def halve(x: Any, n: Any) -> Any:
+            return x > 2.0, [x * 0.5, n + 1]
+
+        count = num.until(halve, [held["x"], np.zeros(len(held["x"]), np.int64)], held["x"] > 1.0, 30)
+        return {"n": count[1], "y": num.matvec(weights, held["v"]) * scale, "t": num.take(table, held["i"])}
+
+    chance = np.random.default_rng(0)
+    given = {"x": chance.uniform(0.1, 5000.0, batch), "v": chance.normal(size=(batch, 10)), "i": chance.integers(0, 300, batch)}
+
+    def shared(state: Any, held: Any) -> Any:
+        return state, step(held, *lifted(held["x"], (3.0, weights, table)))
+
+    program = CudaProgram(traced(shared, (), {k: v[:1] for k, v in given.items()}))
+    call = program.call(program.rows(batch))
+    for key, value in given.items():
+        call.arguments[key][...] = value
+    for scale, factor in ((3.0, 1.0), (0.5, 2.0)):
+        values = [np.array([scale]), (weights * factor).ravel(), (table * factor).ravel()]
+        call.uniforms[:] = program.uniforms(values)
+        got, wanted = call(), step(given, scale, weights * factor, table * factor)
+        for name, value in wanted.items():
+            assert alike(got[name], np.asarray(value)), name
+    assert len(set(wanted["n"])) > 5
+
+
+def test_nothing_is_undefined_in_c(tmp_path: Any) -> None:
+    """No overflow with a sign, no conversion beyond a type, no shift too far: a card would do otherwise than this processor."""
+    checks = "-fsanitize=undefined -fsanitize=float-cast-overflow -fsanitize-undefined-trap-on-error"
+    some = "every_operation or numpys_functions or shared_numbers or (random_graphs and 0)"
+    words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", __file__, "-k", some]
+    made = {"HOST_OPTIONS": checks, "TAILGATE_CACHE": str(tmp_path)}
+    done = subprocess.run(words, env=os.environ | made, capture_output=True, text=True, cwd=Path(__file__).parents[1])
+    assert done.returncode == 0, done.stdout[-1500:] + done.stderr[-1500:]
 
 
 OFTEN = ("elementwise", "types", "sparse", "dense", "inverses", "rare", "in a loop", "read in other places")
