@@ -15,6 +15,7 @@ from tailgate.core import draws
 from tailgate.engine.cards import playing_on
 from tailgate.engine.evaluation import evaluate
 from tailgate.engine.graph import Graph
+from tailgate.engine.matrices import dense
 from tailgate.engine.on_device import CudaProgram
 from tailgate.engine.operations import BINARY, BOOL, COMPARISONS, DTYPES, UNARY
 from tailgate.engine.parameters import lifted
@@ -104,7 +105,7 @@ def test_numpys_functions() -> None:
 
 def test_loops_products_and_shared_numbers() -> None:
     """Rows stop in different rounds; a dense matrix that is not square; numbers that change between calls, in tables too."""
-    weights, batch = np.random.default_rng(1).normal(size=(7, 10)), 40
+    weights, batch = np.random.default_rng(1).normal(size=(10, 7)), 40
     table = np.random.default_rng(2).normal(size=(300, 2))
 
     def step(held: Any, scale: Any = 1.0, weights: Any = weights, table: Any = table) -> Any:
@@ -112,7 +113,8 @@ def test_loops_products_and_shared_numbers() -> None:
             return x > 2.0, [x * 0.5, n + 1]
 
         count = num.until(halve, [held["x"], np.zeros(len(held["x"]), np.int64)], held["x"] > 1.0, 30)
-        return {"n": count[1], "y": num.matvec(weights, held["v"]) * scale, "t": num.take(table, held["i"])}
+        layer = dense(held["v"], weights, table[0, :1] + np.zeros(7))
+        return {"n": count[1], "y": layer * scale, "t": num.take(table, held["i"])}
 
     chance = np.random.default_rng(0)
     given = {"x": chance.uniform(0.1, 5000.0, batch), "v": chance.normal(size=(batch, 10)), "i": chance.integers(0, 300, batch)}
