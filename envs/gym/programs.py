@@ -21,10 +21,9 @@ from tailgate.base.pytree import leaves, map_leaves
 from tailgate.core import draws
 from tailgate.core.draws import Keys
 from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
-from tailgate.engine.on_device import program_class
 from tailgate.engine.operations import Array, ArrayLike
 from tailgate.engine.parameters import lifted
-from tailgate.engine.program import Call, Trace, traced
+from tailgate.engine.program import Call, Trace, program_class, traced
 from tailgate.engine.remembered import Remembered
 
 if TYPE_CHECKING:

@@ -251,8 +251,3 @@ def _memory(program: CudaProgram, size: int, episodes: int) -> Memory:
 def _whole(at: int, size: int) -> Array:
     """Return the memory of this machine at an address."""
     return np.ctypeslib.as_array((ctypes.c_uint8 * size).from_address(at))
-
-
-def program_class(device: str) -> type[Program]:
-    """Return the class of programs that play on a device."""
-    return CudaProgram if device == "cuda" else Program

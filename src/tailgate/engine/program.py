@@ -185,6 +185,15 @@ class Program:
         return self._reading.bits(values)
 
 
+def program_class(device: str) -> type[Program]:
+    """Return the class of programs that play on a device."""
+    if device == "cpu":
+        return Program
+    from tailgate.engine.on_device import CudaProgram  # what only a card needs
+
+    return CudaProgram
+
+
 class State:
     """The state of episodes in blocks of one vector each, for all programs whose states have the same leaves."""
 

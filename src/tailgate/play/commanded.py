@@ -16,9 +16,8 @@ from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import Loop, LoopState
 from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
 from tailgate.engine.cards import device
-from tailgate.engine.on_device import program_class
 from tailgate.engine.parameters import lifted
-from tailgate.engine.program import traced
+from tailgate.engine.program import program_class, traced
 from tailgate.engine.remembered import Remembered
 from tailgate.play.trace import Recorder, signals_of
 

@@ -13,10 +13,9 @@ from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import Loop, LoopState
 from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
 from tailgate.engine.cards import device
-from tailgate.engine.on_device import program_class
 from tailgate.engine.operations import Array
 from tailgate.engine.parameters import lifted
-from tailgate.engine.program import traced
+from tailgate.engine.program import program_class, traced
 from tailgate.engine.remembered import Remembered
 
 STEPS = 32  # between checks if all episodes have ended
