@@ -82,6 +82,13 @@ def test_actions_that_are_refused(device: str, host_card: HostCard) -> None:
     for wrong in (torch.zeros(3, dtype=torch.int64), torch.full((4,), env.single_action_space.n), torch.full((4,), -1), torch.zeros(4)):
         with pytest.raises(InputError, match="actions"):
             env.step(wrong)
+    box = TensorVecEnv(2, device=device, **(FOLLOWING | {"action": "continuous"}))
+    box.reset(seed=0)
+    size = box.single_action_space.shape
+    box.step(torch.full((2, *size), 1.0 + 1e-7))
+    for wrong in (torch.full((2, *size), 1.5), torch.full((2, *size), torch.nan)):
+        with pytest.raises(InputError, match="actions: got .* finite numbers"):
+            box.step(wrong)
     with pytest.raises(InputError, match="id: got 'nothing'"):
         TensorVecEnv(4, "nothing")
 

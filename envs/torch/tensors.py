@@ -24,6 +24,7 @@ from tailgate.engine.on_device import CudaProgram, DeviceCall
 from tailgate.envs.gym.attacker_mdp import CAR_FOLLOWING, FACES
 from tailgate.envs.gym.batches import TracedEpisodes
 from tailgate.envs.gym.gymnasium_env import AdversaryVectorEnv
+from tailgate.envs.gym.specs import ROUNDING
 
 Tensor = torch.Tensor
 Tensors = dict[str, Any]  # by name; the last step's under same_step may hold such a mapping
@@ -98,7 +99,8 @@ class TensorVecEnv:
             fits, wanted = not actions.is_floating_point() and actions.dtype != torch.bool, f"whole numbers from 0 to {n - 1}"
             fits = fits and bool(((actions >= 0) & (actions < n)).all())
         else:
-            fits, wanted = actions.is_floating_point() and bool((actions.abs() <= 1.0).all()), "finite numbers in [-1, 1]"
+            fits = actions.dtype != torch.bool and bool((actions.abs() <= 1.0 + ROUNDING).all())
+            wanted = "finite numbers in [-1, 1]"
         if not fits:
             raise InputError("actions", actions.flatten()[:20].tolist(), wanted)
         return actions
