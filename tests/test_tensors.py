@@ -87,7 +87,7 @@ def test_actions_that_are_refused(device: str, host_card: HostCard) -> None:
     size = box.single_action_space.shape
     box.step(torch.full((2, *size), 1.0 + 1e-7))
     for wrong in (torch.full((2, *size), 1.5), torch.full((2, *size), torch.nan)):
-        with pytest.raises(InputError, match="actions: got .* finite numbers"):
+        with pytest.raises(InputError, match=r"actions: got .* finite numbers"):
             box.step(wrong)
     with pytest.raises(InputError, match="id: got 'nothing'"):
         TensorVecEnv(4, "nothing")
