@@ -51,12 +51,13 @@ def trace_as_plain(loop, rival):
     return plain
 
 
-def as_plain(arguments, rows, folder, engine="traced"):
+def as_plain(arguments, rows, folder, engine="traced", device="cpu"):
     """So many rows of both engines, in a scenario so short that all begin again; some are reset by a mask, one in two of them with a seed."""
     text = folder / "short.yaml"
     text.write_text(short(arguments["scenario"]))
-    one, two = (AdversaryVectorEnv(rows, engine=one, **(arguments | {"scenario": str(text)})) for one in (engine, "plain"))
-    assert (one.engine, two.engine) == (engine, "plain")
+    arguments = arguments | {"scenario": str(text)}
+    one, two = AdversaryVectorEnv(rows, engine=engine, device=device, **arguments), AdversaryVectorEnv(rows, engine="plain", **arguments)
+    assert (one.engine, two.engine) == (engine, "plain") and (one.device, two.device) == (device, "cpu")
     for first, second in zip(one.reset(seed=3), two.reset(seed=3), strict=True):
         same(first, second)
     rng, ended = np.random.default_rng(0), 0

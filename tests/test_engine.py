@@ -8,7 +8,7 @@ import pytest
 from tailgate.engine.evaluation import evaluate
 from tailgate.engine.graph import Graph, Node
 from tailgate.engine.operations import BOOL, COMPARISONS, DTYPES, FLOAT
-from tailgate.engine.program import Call, Program, State, Trace
+from tailgate.engine.program import Program, Trace
 
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, 1e-310, -5e-324, 1e308, -1e308, np.inf, -np.inf, np.nan, 2.0**63, -(2.0**63), 3.7, 255.5])
 
@@ -112,6 +112,35 @@ def same(got: np.ndarray, wanted: np.ndarray) -> bool:
     return bool((((got == wanted) & (np.signbit(got) == np.signbit(wanted))) | (np.isnan(got) & np.isnan(wanted))).all())
 
 
+def as_numpy(program: Program, uniforms: list[Node], shapes: dict[str, Any], batch: int, values: Any, chance: np.random.Generator) -> None:
+    """Three steps of a random trace, for other values of the numbers that all share if given."""
+    trace, graph = program.trace, program.trace.graph
+    if values:  # what the reference goes by
+        graph._values = {node.id: values[node.attr] for node in uniforms}
+    memory = program.rows(batch)
+    call = program.call(memory)
+    call.uniforms[:] = program.uniforms(values)
+    state = {name: numbers(chance, dtype, 2 * batch).reshape(batch, 2) for name, dtype in shapes.items()}
+    memory.put(state)
+    for _ in range(3):
+        given: dict[Any, np.ndarray] = {}
+        for name, nodes in trace.arguments.items():
+            held = call.arguments[name]
+            held[...] = numbers(chance, held.dtype, held.size).reshape(held.shape)
+            given |= {node.attr: held[:, i] for i, node in enumerate(nodes.flat)}
+        given |= {node.attr: state[name][:, i] for name, (nodes, _) in trace.state.items() for i, node in enumerate(nodes.flat)}
+        results = call()
+        after = {name: evaluate(graph, list(new.flat), given) for name, (_, new) in trace.state.items()}
+        held_state = memory.get(state)
+        for name, columns in after.items():
+            wanted = np.stack([np.broadcast_to(column, batch) for column in columns], 1).astype(shapes[name])
+            assert same(held_state[name], wanted), (program.lanes, batch, name)
+        for name, nodes in trace.results.items():
+            for i, column in enumerate(evaluate(graph, list(nodes.flat), given)):
+                assert same(results[name][:, i], np.asarray(column)), (program.lanes, batch, name, i, nodes.flat[i])
+        state = held_state
+
+
 @pytest.mark.parametrize("seed", range(24))
 def test_random_graphs(seed: int) -> None:
     trace, uniforms, shapes = random_trace(seed)
@@ -121,28 +150,4 @@ def test_random_graphs(seed: int) -> None:
     for lanes in (2, 4, 8):
         program = Program(trace, lanes, least=int(chance.integers(1, 20)))
         for batch, values in zip(batches, (None, others, None, others), strict=True):
-            graph = trace.graph
-            if values:  # what the reference goes by
-                graph._values = {node.id: values[node.attr] for node in uniforms}
-            memory = State(program, batch)
-            call = Call(program, memory)
-            call.uniforms[:] = program.uniforms(values)
-            state = {name: numbers(chance, dtype, 2 * batch).reshape(batch, 2) for name, dtype in shapes.items()}
-            memory.put(state)
-            for _ in range(3):
-                given: dict[Any, np.ndarray] = {}
-                for name, nodes in trace.arguments.items():
-                    held = call.arguments[name]
-                    held[...] = numbers(chance, held.dtype, held.size).reshape(held.shape)
-                    given |= {node.attr: held[:, i] for i, node in enumerate(nodes.flat)}
-                given |= {node.attr: state[name][:, i] for name, (nodes, _) in trace.state.items() for i, node in enumerate(nodes.flat)}
-                results = call()
-                after = {name: evaluate(graph, list(new.flat), given) for name, (_, new) in trace.state.items()}
-                held_state = memory.get(state)
-                for name, columns in after.items():
-                    wanted = np.stack([np.broadcast_to(column, batch) for column in columns], 1).astype(shapes[name])
-                    assert same(held_state[name], wanted), (lanes, batch, name)
-                for name, nodes in trace.results.items():
-                    for i, column in enumerate(evaluate(graph, list(nodes.flat), given)):
-                        assert same(results[name][:, i], np.asarray(column)), (lanes, batch, name, i, nodes.flat[i])
-                state = held_state
+            as_numpy(program, uniforms, shapes, batch, values, chance)

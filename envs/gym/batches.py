@@ -13,6 +13,7 @@ from tailgate.base.pytree import leaves, with_leaves
 from tailgate.core import Array, Frame, View
 from tailgate.core.draws import Keys
 from tailgate.core.loop import LoopState
+from tailgate.engine import cards
 from tailgate.engine.agreement import Untraced
 from tailgate.envs.gym.attacker_mdp import Outcome, Seat, Tally
 from tailgate.envs.gym.programs import Rows, SeatPrograms, programs_of
@@ -33,6 +34,10 @@ class Episodes(Protocol):
     """B rows of episodes, each with its own seed."""
 
     engine: str
+    device: str
+
+    def check(self, batch: int) -> None:
+        """Raise InputError if the device has no memory for these rows."""
 
     @property
     def number(self) -> Array:
@@ -70,19 +75,26 @@ def framed(now: Array, before: Array | None, frames: int) -> Array:
     return np.tile(now, frames) if before is None else np.concatenate([now, before[:, : -now.shape[1]]], axis=1)
 
 
-def side_by_side(seat: Seat, engine: str = "auto", drawn: bool = False, threads: int = 1) -> Episodes:
+def side_by_side(seat: Seat, engine: str = "auto", drawn: bool = False, threads: int = 1, device: str | None = None) -> Episodes:
     """Choose the engine; auto: traced where it is possible, else plain. `drawn`: pictures may be asked for.
 
-    Of several `threads` each plays 2048 episodes and more.
+    Of several `threads` each plays 2048 episodes and more. `device`: cpu or cuda; None is that of `cards.playing_on`.
     """
     sizes.check("threads", threads)
+    device = cards.device() if device is None else cards.checked(device)
     if engine not in ENGINES:
         raise unknown("engine", engine, ENGINES)
+    if device != "cpu":
+        cards.card()
+        if engine == "plain":
+            raise InputError("engine", engine, f"traced or auto with the device {device}: the plain loop plays on cpu")
     if engine == "plain":
         return PlainEpisodes(seat)
-    programs = programs_of(seat)
+    programs = programs_of(seat, device)
     if not isinstance(programs, Untraced):
         return TracedEpisodes(programs, drawn, threads)
+    if device != "cpu":
+        raise cards.DeviceError("device", device, f"cpu: {programs.why}")
     if engine == "traced":
         raise InputError("engine", engine, f"plain or auto: {programs.why}")
     return PlainEpisodes(seat, programs.why)
@@ -91,7 +103,7 @@ def side_by_side(seat: Seat, engine: str = "auto", drawn: bool = False, threads:
 class PlainEpisodes:
     """The plain loop, which plays everything."""
 
-    engine = "plain"
+    engine, device = "plain", "cpu"
 
     def __init__(self, seat: Seat, why: str = "") -> None:
         self.seat, self.why = seat, why  # the second: why no other engine plays, where somebody asked
@@ -99,6 +111,8 @@ class PlainEpisodes:
         self.tally: Tally | None = None
         self.frame: Frame | None = None  # the last step
         self._looked: tuple[LoopState, View] | None = None  # the last state that was looked at, and what was seen
+
+    def check(self, batch: int) -> None: ...
 
     @property
     def number(self) -> Array:
@@ -174,8 +188,13 @@ class TracedEpisodes:
 
     def __init__(self, programs: SeatPrograms, drawn: bool = False, threads: int = 1) -> None:
         self.programs, self._drawn, self._threads = programs, drawn, threads
+        self.device = programs.device
         self.rows: Rows | None = None
         self.shadow: Shadow | None = None
+
+    def check(self, batch: int) -> None:
+        for program in self.programs.programs:
+            program.check("num_envs", batch)
 
     @property
     def number(self) -> Array:
@@ -231,10 +250,11 @@ class TracedEpisodes:
 
     def __getstate__(self) -> dict[str, Any]:
         held = None if self.rows is None else (self.rows.batch, self.rows.held(), self.rows.brought)
-        return {"seat": self.programs.seat, "drawn": self._drawn, "threads": self._threads, "held": held, "shadow": self.shadow}
+        named = {"seat": self.programs.seat, "drawn": self._drawn, "threads": self._threads, "device": self.device}
+        return named | {"held": held, "shadow": self.shadow}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        programs = programs_of(state["seat"])
+        programs = programs_of(state["seat"], state["device"])
         assert isinstance(programs, SeatPrograms), "it was traced before"
         self.__init__(programs, state["drawn"], state["threads"])  # type: ignore[misc]
         if state["held"] is not None:

@@ -43,7 +43,8 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
 
     def __init__(
         self, num_envs: int = 1, *, render_mode: str | None = None, autoreset: str | AutoresetMode = "next_step", viewer: str = "auto",
-        size: tuple[int, int] | None = None, engine: str = "auto", threads: int = 1, max_episode_steps: int | None = None, **arguments: Any,
+        size: tuple[int, int] | None = None, engine: str = "auto", threads: int = 1, max_episode_steps: int | None = None,
+        device: str | None = None, **arguments: Any,
     ) -> None:  # fmt: skip
         num_envs = sizes.check("num_envs", num_envs)
         autoreset = autoreset.name.lower() if isinstance(autoreset, AutoresetMode) else autoreset
@@ -67,7 +68,8 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
         self.single_action_space = action_space(self.seat.action)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.episodes = side_by_side(self.seat, engine, render_mode is not None, threads)
+        self.episodes = side_by_side(self.seat, engine, render_mode is not None, threads, device)
+        self.episodes.check(num_envs)
         self.begun = False
         self.over = np.zeros(num_envs, bool)
         self._frames = self.seat.observation.frames
@@ -80,6 +82,11 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
     def engine(self) -> str:
         """The engine that plays: traced or plain. Both play the same episodes."""
         return self.episodes.engine
+
+    @property
+    def device(self) -> str:
+        """The device that plays: cpu or cuda. Both play the same episodes."""
+        return self.episodes.device
 
     @property
     def engine_why(self) -> str:
@@ -258,6 +265,9 @@ class AdversaryEnv(Specified, gymnasium.Env[Array, Any]):
     def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
         if "autoreset" in arguments:
             raise InputError("autoreset", arguments["autoreset"], "a vector environment (make_vec); a single one is reset by its user")
+        if arguments.get("device") not in (None, "cpu"):
+            raise InputError("device", arguments["device"], "cpu, or a vector environment (make_vec)")
+        arguments["device"] = "cpu"  # a card plays many episodes, not one
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InputError("render_mode", render_mode, "None, 'rgb_array' or 'human'")
         drawn = None if render_mode is None else "rgb_array"

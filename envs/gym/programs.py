@@ -23,7 +23,7 @@ from tailgate.core.draws import Keys
 from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
 from tailgate.engine.operations import Array, ArrayLike
 from tailgate.engine.parameters import lifted
-from tailgate.engine.program import Call, Program, State, Trace, traced
+from tailgate.engine.program import Call, Trace, program_class, traced
 from tailgate.engine.remembered import Remembered
 
 if TYPE_CHECKING:
@@ -46,8 +46,9 @@ class Episodes(NamedTuple):
 class SeatPrograms:
     """The programs of a seat; tracing raises whatever its parts raise."""
 
-    def __init__(self, seat: Seat, shown: Seat | None = None) -> None:
+    def __init__(self, seat: Seat, shown: Seat | None = None, device: str = "cpu") -> None:
         check_open(seat.loop)
+        self.device = device
         self.seat, self.loop, self.shown = seat, seat.loop, shown or _shown_once(seat)
         self.values: list[Array] | None = None  # of the parameters, if they differ from the traced ones
         self.example = _example(seat)
@@ -63,7 +64,7 @@ class SeatPrograms:
         if _several(seat):
             traces.append(traced(self._advance, state, {"action": action, "over": flags}))
         twins = _twins(*traces)
-        self.programs = tuple(Program(trace, twins=twins) for trace in traces)
+        self.programs = tuple(program_class(device)(trace, twins=twins) for trace in traces)
         self.decide, self.begin, *advance = self.programs
         self.advance = advance[0] if advance else None
 
@@ -158,13 +159,13 @@ def _shown(seat: Seat, state: Episodes) -> dict[str, Array]:
 _made: Remembered[SeatPrograms] = Remembered()
 
 
-def programs_of(seat: Seat) -> SeatPrograms | Untraced:
-    """Return the programs of a seat, if they equal the plain loop on this machine; else the reason why there are none."""
+def programs_of(seat: Seat, device: str = "cpu") -> SeatPrograms | Untraced:
+    """Return the programs of a seat on a device, if they equal the plain loop on this machine; else the reason why there are none."""
     shown = _shown_once(seat)
     return _made.proved(
-        shown,
+        (shown, device),
         lambda: _shown(shown, _example(shown)),
-        lambda: SeatPrograms(seat, shown),
+        lambda: SeatPrograms(seat, shown, device),
         lambda found, values: found.of(seat, values),
         difference,
     )
@@ -212,19 +213,19 @@ class Rows:
 
     def __init__(self, programs: SeatPrograms, batch: int, threads: int = 1) -> None:
         self.programs, self.batch, self.threads = programs, batch, threads
-        self.state = State(programs.decide, batch)
-        self._decide = self._last = Call(programs.decide, self.state, values=programs.values, threads=threads)
+        self.state = programs.decide.rows(batch)
+        self._decide = self._last = programs.decide.call(self.state, values=programs.values, threads=threads)
         self._brought: dict[str, Array] | None = {}
         self._k = 0  # of a single row, after its last decision
 
     @cached_property
     def _begin(self) -> Call:
-        return Call(self.programs.begin, self.state, values=self.programs.values, threads=self.threads)
+        return self.programs.begin.call(self.state, values=self.programs.values, threads=self.threads)
 
     @cached_property
     def _advance(self) -> Call:
         assert self.programs.advance is not None
-        return Call(self.programs.advance, self.state, self.programs.between, self.programs.values, self.threads, self._decide)
+        return self.programs.advance.call(self.state, self.programs.between, self.programs.values, self.threads, self._decide)
 
     @cached_property
     def _alone(self) -> _Alone:

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from tailgate.base.progress import console
-from tailgate.cli.shared import Commands, print_json, working
+from tailgate.cli.shared import Commands, print_json, table, working
 
 
 def add(commands: Commands) -> None:
@@ -20,6 +20,7 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     command.add_argument("--only", action="append", metavar="NAME", help="this target, line or scaling only (repeatable)")
     command.add_argument("--list", action="store_true", help="list targets, lines and scalings, and measure nothing")
+    command.add_argument("--device", default="cpu", metavar="NAME", help="cuda: this package on a card instead; bits are compared first")
     command.add_argument("--rounds", type=int, default=7, metavar="N", help="rounds of each line (default 7; half as many for scalings)")
     command.add_argument("--seconds", type=float, default=0.5, metavar="S", help="seconds of a line in a round, about (default 0.5)")
     command.add_argument("--out", metavar="DIR", help="write speed.json, speed.md and plots here (the plots need tailgate[viz])")
@@ -32,6 +33,8 @@ def _bench(options: argparse.Namespace) -> int:
     from tailgate.bench.run import bench
     from tailgate.bench.targets import chosen
 
+    if options.device != "cpu":
+        return _card(options)
     targets, lines, plots = chosen(options.only)
     if options.list:
         listed = {
@@ -61,3 +64,23 @@ def _bench(options: argparse.Namespace) -> int:
         if why:
             print(why, file=sys.stderr)
     return 0
+
+
+def _card(options: argparse.Namespace) -> int:
+    """Measure a card. Exit code 1 if its bits are not those of the processor."""
+    from tailgate.bench import cards
+
+    if options.list:
+        for name, plant in cards.PLANTS.items():
+            print(f"{name:<24}{plant.scenario}, {plant.defence}")
+        return 0
+    with working() as update:
+        record = cards.bench(options.only, options.rounds, options.seconds, update)
+    if options.json:
+        print_json(record)
+    else:
+        cards.print_record(record, table)
+    if options.out:
+        path = cards.write(record, Path(options.out))
+        print(f"written: {path}", file=sys.stderr)
+    return 0 if record["equal"] else 1

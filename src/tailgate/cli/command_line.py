@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from importlib import import_module
 from typing import Any, NoReturn
 
@@ -34,7 +35,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _done(arguments: Sequence[str] | None, chosen: argparse.Namespace, ending: Ending) -> int:
     try:
         _parser().parse_args(arguments, chosen)
-        return int(chosen.run(chosen))
+        with _device(chosen):
+            return int(chosen.run(chosen))
     except InputError as error:
         print(f"tailgate: error: {error}", file=sys.stderr)
         if isinstance(error, Killed):
@@ -50,6 +52,15 @@ def _done(arguments: Sequence[str] | None, chosen: argparse.Namespace, ending: E
     except BrokenPipeError:  # the reader of our output has gone
         sys.stderr.close()
         return 0
+
+
+def _device(chosen: argparse.Namespace) -> AbstractContextManager[None]:
+    """Play on the device that a command was given."""
+    if getattr(chosen, "device", "cpu") == "cpu":
+        return nullcontext()
+    from tailgate.engine.cards import playing_on
+
+    return playing_on(chosen.device)
 
 
 def _kept(chosen: argparse.Namespace) -> str:

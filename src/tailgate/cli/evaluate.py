@@ -31,7 +31,7 @@ def add(commands: Commands) -> None:
     command.add_argument("--seeds", type=int, metavar="N", help="episodes per cell instead of the suite's")
     add_options(command, "--purpose")
     command.add_argument("--batch", type=int, default=256, metavar="N", help="episodes side by side (default 256); changes no result")
-    add_options(command, "--workers")
+    add_options(command, "--workers", "--device")
     command.add_argument("--engine", default="local", choices=["local"], help="where workers run")
     command.add_argument("--out", metavar="FILE", help="write rows here (JSON Lines); an interrupted run resumes, other rows are set aside")
     command.add_argument("--plot", metavar="DIR", help="draw defences x attacks: error, smallest gap, collisions (needs tailgate[viz])")

@@ -73,7 +73,8 @@ def folder() -> Path | None:
     return None
 
 
-def _kept(name: str) -> bytes | None:
+def kept(name: str) -> bytes | None:
+    """Return the content of an object in the folder, or None."""
     place = folder()
     if place is None:
         return None
@@ -86,7 +87,8 @@ def _kept(name: str) -> bytes | None:
     return None
 
 
-def _keep(name: str, content: bytes) -> None:
+def keep(name: str, content: bytes) -> None:
+    """Write an object to the folder, if there is one."""
     place = folder()
     if place is None:
         return
@@ -110,13 +112,13 @@ def _compiled(text: str) -> bytes:
 
 def proved(names: Sequence[str]) -> bool:
     """Return True if code of these objects has been found equal to plain code on this machine."""
-    return all(_kept(f"{name}.equal") is not None for name in names)
+    return all(kept(f"{name}.equal") is not None for name in names)
 
 
 def prove(names: Sequence[str]) -> None:
     """Record that code of these objects equals plain code."""
     for name in names:
-        _keep(f"{name}.equal", b"")
+        keep(f"{name}.equal", b"")
 
 
 class Function:
@@ -127,11 +129,11 @@ class Function:
             binding = _binding()
             key = "\0".join((text, str(level()), *processor(), binding.llvm_version_info and str(binding.llvm_version_info))).encode()
             name = hashlib.sha256(VERSION + key).hexdigest() + ".o"
-            content = _kept(name)
+            content = kept(name)
             self.name, self.fresh = name, content is None
             if content is None:
                 content = _compiled(text)
-                _keep(name, content)
+                keep(name, content)
             self._engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _machine())
             self._engine.add_object_file(binding.ObjectFileRef.from_data(content))
             self._engine.finalize_object()

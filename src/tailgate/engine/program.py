@@ -138,9 +138,26 @@ class Program:
                     layout.inputs[node.id] = Column(number, column, len(nodes))
                 else:
                     layout.outputs.append((node, Column(number, column, len(nodes))))
-        self.text, self.size, self.room = text_of(layout, len(self.arrays), self.lanes, least)
-        self.function = objects.Function(self.text)
+        self.text, self.size, self.room, self.function = self._compiled(layout, least)
         self._reading = Reading(trace.graph, layout.slots)
+
+    def _compiled(self, layout: Layout, least: int) -> tuple[str, dict[str, int], int, objects.Function]:
+        """Return the text, its numbers of nodes and branches, the bytes of its buffers, and the machine code."""
+        text, size, room = text_of(layout, len(self.arrays), self.lanes, least)
+        return text, size, room, objects.Function(text)
+
+    def rows(self, episodes: int) -> State:
+        """Return a state of some episodes."""
+        return State(self, episodes)
+
+    def check(self, field: str, episodes: int, steps: int = 1) -> None:
+        """Raise InputError for `field` if the program's device has no memory for these episodes."""
+
+    def call(
+        self, state: State, steps: int = 1, values: Sequence[Array] | None = None, threads: int = 1, like: Call | None = None
+    ) -> Call:
+        """Return calls on a state, see `Call`."""
+        return Call(self, state, steps, values, threads, like)
 
     def _places(self) -> tuple[dict[str, int], int]:
         """Return the offset of each leaf of the state in a block, widest numbers first, and the bytes of a block."""
@@ -166,6 +183,15 @@ class Program:
     def uniforms(self, values: Sequence[Array] | None = None) -> Array:
         """Return the shared numbers as the code reads them, for other parameter `values` if given (see engine/parameters.py)."""
         return self._reading.bits(values)
+
+
+def program_class(device: str) -> type[Program]:
+    """Return the class of programs that play on a device."""
+    if device == "cpu":
+        return Program
+    from tailgate.engine.on_device import CudaProgram  # what only a card needs
+
+    return CudaProgram
 
 
 class State:

@@ -104,7 +104,7 @@ def _round(e: Emitter, body: Sweep, numbers: Sequence[str], tables: dict[int, st
         key = source.held.id, index, source.offset
         if key not in made:
             place = numbers
-            if not _alike(inner, body, source):
+            if not alike(inner, body, source):
                 place = [index if not source.offset else e.set(f"add i64 {index}, {source.offset}")]
             _round(e, inner, place, tables, made)
             made[key] = e.value(inner.after[0])
@@ -113,7 +113,7 @@ def _round(e: Emitter, body: Sweep, numbers: Sequence[str], tables: dict[int, st
     e.emit(rounds(body), {})
 
 
-def _alike(inner: Sweep, outer: Sweep, source: Source) -> bool:
+def alike(inner: Sweep, outer: Sweep, source: Source) -> bool:
     """Return True if each round of `outer` reads the result of the same round of `inner`."""
     return inner.shape == outer.shape and source.offset == 0 and source.strides == steps(inner.shape)
 
@@ -126,7 +126,7 @@ def merged(items: Sequence[Item], kept: Iterable[Node]) -> set[int]:
     def used(node: Node, times: int) -> None:
         uses[node.id] = uses.get(node.id, 0) + times
 
-    nodes = {node.id: node for item in items for node in _of(item)}
+    nodes = {node.id: node for item in items for node in inside(item)}
     within = {inner.id: node.id for node in nodes.values() if node.op in ("loop", "sweep") for inner in node.attr.nodes}
     results = [after for node in nodes.values() if node.op in ("loop", "sweep") for after in node.attr.after]
     for node in (*kept, *results):
@@ -143,7 +143,7 @@ def merged(items: Sequence[Item], kept: Iterable[Node]) -> set[int]:
                     inner: Sweep = source.held.attr
                     once = all(stride or n == 1 for stride, n in zip(source.strides, node.attr.shape, strict=True))
                     once = once and within.get(source.held.id) == within.get(node.id)
-                    fits = len(inner.after) == 1 and (len(inner.shape) == 1 or _alike(inner, node.attr, source))
+                    fits = len(inner.after) == 1 and (len(inner.shape) == 1 or alike(inner, node.attr, source))
                     used(source.held, 1 if once and fits else MERGED + 1)
     out = set()
     for i, node in sorted(nodes.items()):
@@ -275,7 +275,7 @@ def rooms(items: Sequence[Item], kept: Iterable[Node], lanes: int, none: Collect
     turn: dict[int, int] = {}
     nodes: dict[int, Node] = {}
     for i, item in enumerate(items):
-        for node in _of(item):
+        for node in inside(item):
             nodes[node.id], turn[node.id] = node, i
     last = {i: turn[i] for i in nodes}
     for node in kept:
@@ -305,14 +305,14 @@ def rooms(items: Sequence[Item], kept: Iterable[Node], lanes: int, none: Collect
     return out, total
 
 
-def _of(item: Item) -> Iterator[Node]:
+def inside(item: Item) -> Iterator[Node]:
     """Yield the nodes of an item, with those inside it."""
     if isinstance(item, Branch):
         yield from item.decides
         for inner in item.body:
-            yield from _of(inner)
+            yield from inside(inner)
     else:
         yield item
         if item.op in ("loop", "sweep"):
             for inner in item.attr.nodes:
-                yield from _of(inner)
+                yield from inside(inner)

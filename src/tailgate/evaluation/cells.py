@@ -28,6 +28,8 @@ from tailgate.core.registry import Entry, Family, Spec, entry_for, said, text_of
 from tailgate.core.scenario import Scenario, Suite, load_scenario, load_suite
 from tailgate.core.schema import as_data, canonical
 from tailgate.core.threat import Brief
+from tailgate.engine.cards import DeviceError, device, playing_on
+from tailgate.evaluation.devices import check_cells
 from tailgate.evaluation.resume import complete
 from tailgate.evaluation.rounds import numbered
 from tailgate.evaluation.rows import packed
@@ -118,6 +120,8 @@ def _played(head: dict[str, Any], seeds: Sequence[int], trace: Trace) -> list[di
 
 def _why(error: Exception, seeds: Sequence[int] = ()) -> tuple[str, str]:
     """Return the reason and status of the rows of these seeds, which an error affects."""
+    if isinstance(error, DeviceError):
+        raise error
     if isinstance(error, NotApplicable):
         return str(error), "skipped"
     row = error.row if isinstance(error, InputError) else None
@@ -134,7 +138,7 @@ def _head(cell: Cell, place: Scenario, defence: Entry, attack: Entry, identity: 
         "engine": ENGINE, "versions": {"defence": defence.version, "attack": attack.version},
         "defence_digest": _digest("defence", cell.defence, identity), "attack_digest": _digest("attack", cell.attack, identity),
         "config_hash": place.config_hash, "version": VERSION, "cell": identity,
-        "trained": origin(cell.attack) if identity else None,
+        "trained": origin(cell.attack) if identity else None, **({} if device() == "cpu" else {"device": device()}),
     }  # fmt: skip
 
 
@@ -230,6 +234,7 @@ def run(
     count = sum(sizes.check("seeds", cell.seeds) for cell in cells)
     sizes.fits(count * sizes.ROW, "seeds", max((cell.seeds for cell in cells), default=0), f"{count:,} rows")
     sizes.announce(count / sizes.EPISODES_A_SECOND / workers, count * sizes.ROW, f"{count:,} episodes")
+    check_cells(cells, workers)
     ids = [cell_id(cell) for cell in cells]
     pieces = {i: [(i, seed) for seed in cell.episodes] for i, cell in zip(ids, cells, strict=True)}
     return complete(ids, pieces, out, lambda missing: _play([cells[i] for i in missing], workers), progress)
@@ -237,7 +242,7 @@ def run(
 
 def _play(cells: Sequence[Cell], workers: int) -> Generator[tuple[int, list[dict[str, Any]]]]:
     foreign = any(Spec("defence", cell.defence).imports or Spec("attack", cell.attack).imports for cell in cells)
-    if not foreign and (workers == 1 or len(cells) < 2):
+    if device() != "cpu" or (not foreign and (workers == 1 or len(cells) < 2)):
         for i, cell in enumerate(cells):
             yield i, run_cell(cell)
         return
@@ -261,6 +266,7 @@ def evaluate(
     threat: dict[str, Any] | None = None,
     beacon: str = "",
     progress: Callable[[int, int], None] | None = None,
+    device: str | None = None,
 ) -> list[dict[str, Any]]:
     """Play a suite, or the part of it given by the arguments, and return its rows.
 
@@ -273,12 +279,19 @@ def evaluate(
     beacon : the round that the episodes belong to
     batch, workers : episodes played together, and processes; they change no bit
     out : file for the rows
+    device : cpu or cuda; changes no bit. None is that of `tailgate.engine.cards.playing_on`, cpu if nobody chose
 
     Raises
     ------
     InputError
         An argument is invalid; nothing is played then.
     """
+    if device is not None:
+        with playing_on(device):
+            return evaluate(
+                suite, defences=defences, attacks=attacks, scenarios=scenarios, doses=doses, seeds=seeds, purpose=purpose, batch=batch,
+                workers=workers, out=out, threat=threat, beacon=beacon, progress=progress,
+            )  # fmt: skip
     base = load_suite(suite) if isinstance(suite, str) else suite if suite is not None else Suite(name="custom")
     defences = list(base.defences if defences is None else defences)
     attacks = list(base.attacks if attacks is None else attacks)

@@ -8,7 +8,7 @@ A decision's hash is the same on every platform.
 A trace's hash is exact for one machine type with one numpy and one llvmlite, which compiles random numbers and traced loops.
 It is compared only where these match the record.
 
-    python -m tailgate.evaluation.golden --check [--scenario NAME ...]
+    python -m tailgate.evaluation.golden --check [--scenario NAME ...] [--device cuda]
     python -m tailgate.evaluation.golden --write [--suite NAME ...]
 """
 
@@ -39,7 +39,9 @@ from tailgate.core.draws import Draws, Keys
 from tailgate.core.loop import Loop
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, Suite, list_suites, load_scenario, load_suite
+from tailgate.engine.cards import device, playing_on
 from tailgate.envs.gym.mixture import Mixture, MixtureState
+from tailgate.evaluation.devices import untraced
 from tailgate.play.trace import Trace, rollout
 
 FORMAT = "tailgate-golden-2"
@@ -57,7 +59,7 @@ class _Blocks(Mixture):
 
     def start(self, plan: tuple[Any, ...], batch: int, draws: Draws) -> MixtureState:
         state = super().start(plan, batch, draws)
-        return state._replace(member=np.arange(batch) // (batch // len(plan)))
+        return state._replace(member=np.arange(batch) // max(1, batch // len(plan)))
 
 
 def this_platform() -> str:
@@ -199,6 +201,8 @@ def check(name: str, held: dict[str, Any]) -> list[str]:
         if not found:
             out.append(f"{name}: {defence} can no longer serve it")
             continue
+        if device() != "cpu" and untraced(found[0][1]):
+            continue  # the plain loop plays it, on the processor
         attacks, episodes = [cell["attack"] for cell in mine], entry.get("episodes", EPISODES)
         for was, now in zip(mine, cells(found[0][1], defence, attacks, episodes), strict=True):
             where = f"{name}, {defence} against {was['attack']}"
@@ -217,13 +221,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     what.add_argument("--write", action="store_true", help="record them again, for a new version")
     parser.add_argument("--scenario", action="append", metavar="NAME", help="only this one, under all suites (repeatable; with --check)")
     parser.add_argument("--suite", action="append", metavar="NAME", help="only this one, a new one (repeatable; with --write)")
+    parser.add_argument("--device", default="cpu", metavar="NAME", help="where they are played: cpu (default) or cuda; with --check")
     options = parser.parse_args(arguments)
     try:
+        if options.device != "cpu" and options.write:
+            raise InputError("--device", options.device, "--check")
         if options.scenario and options.write:
             raise InputError("--scenario", options.scenario, "--check; --write takes --suite")
         if options.suite and options.check:
             raise InputError("--suite", options.suite, "--write; --check takes --scenario")
-        return _write(options.suite) if options.write else _check(options.scenario)
+        with playing_on(options.device):
+            return _write(options.suite) if options.write else _check(options.scenario)
     except (InputError, ImportError) as error:
         print(f"tailgate.evaluation.golden: error: {error}", file=sys.stderr)
         return 2

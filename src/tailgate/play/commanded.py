@@ -15,8 +15,9 @@ from tailgate.core import Array, Attack, Command, Kind, View, WhiteBox, draws, n
 from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import Loop, LoopState
 from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
+from tailgate.engine.cards import device
 from tailgate.engine.parameters import lifted
-from tailgate.engine.program import Call, Program, State, traced
+from tailgate.engine.program import program_class, traced
 from tailgate.engine.remembered import Remembered
 from tailgate.play.trace import Recorder, signals_of
 
@@ -37,7 +38,7 @@ class Commanded:
         self.values: list[Array] | None = None  # of the parameters, if they differ from the traced ones
         begun = _first(loop)
         self.rebuilt = rebuilt(_seen(loop, begun))
-        self.program = Program(traced(self._traced, {"loop": begun}, _nothing(loop, 1)._asdict()))
+        self.program = program_class(device())(traced(self._traced, {"loop": begun}, _nothing(loop, 1)._asdict()))
         self.programs = (self.program,)
         results = list(self.program.trace.results)
         self.names = [name for name in results if name.startswith("seen.")]  # in the order of the leaves
@@ -77,9 +78,9 @@ class Steps:
 
     def __init__(self, commanded: Commanded, begun: LoopState) -> None:
         self.of, self.k = commanded, begun.k
-        self.state = State(commanded.program, len(begun.k))
+        self.state = commanded.program.rows(len(begun.k))
         self.state.put({"loop": begun})
-        self._call = Call(commanded.program, self.state, values=commanded.values)
+        self._call = commanded.program.call(self.state, values=commanded.values)
 
     def play(self, command: Command) -> tuple[dict[str, Array], Array, View]:
         """Play one step under a command; return its signals, who has ended (B,), and the attacker's view after it."""
@@ -128,7 +129,11 @@ _made: Remembered[Commanded] = Remembered()
 def commanded(loop: Loop) -> Commanded | Untraced:
     """Return the program of a loop that takes commands, if it equals the plain loop; else the reason why there is none."""
     return _made.proved(
-        loop, lambda: _seen(loop, _first(loop)), lambda: Commanded(loop), lambda found, values: found.of(loop, values), _difference
+        (loop, device()),
+        lambda: _seen(loop, _first(loop)),
+        lambda: Commanded(loop),
+        lambda found, values: found.of(loop, values),
+        _difference,
     )
 
 

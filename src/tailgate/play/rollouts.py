@@ -12,9 +12,10 @@ from tailgate.core import Attack
 from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import Loop, LoopState
 from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
+from tailgate.engine.cards import device
 from tailgate.engine.operations import Array
 from tailgate.engine.parameters import lifted
-from tailgate.engine.program import Call, Program, State, traced
+from tailgate.engine.program import program_class, traced
 from tailgate.engine.remembered import Remembered
 
 STEPS = 32  # between checks if all episodes have ended
@@ -34,7 +35,7 @@ class Rollout:
         check_open(loop)
         self.loop, self.attack, self.plan = loop, attack, plan
         self.values: list[Array] | None = None  # of the parameters, if they differ from the traced ones
-        self.program = Program(traced(self._traced, self.begun(_ONE), None))
+        self.program = program_class(device())(traced(self._traced, self.begun(_ONE), None))
         self.programs = (self.program,)
 
     def of(self, loop: Loop, attack: Attack, plan: object, values: list[Array]) -> Rollout:
@@ -58,10 +59,11 @@ class Rollout:
     def play(self, keys: Keys, terminate: bool) -> tuple[Array, dict[str, Array], dict[str, Array]]:
         """Play episodes; return lengths (B,), signals (K, B, ...) and the road before the first step, as `Trace` holds them."""
         loop, batch, begun = self.loop, len(keys.key), self.begun(keys)
+        self.program.check("batch", batch, loop.horizon)
         first = loop.plant.scene(loop.plan.plant, begun.loop.plant)._asdict()
-        state = State(self.program, batch)
+        state = self.program.rows(batch)
         state.put(begun)
-        call = Call(self.program, state, max(2, loop.horizon), self.values)
+        call = self.program.call(state, max(2, loop.horizon), self.values)
         call.begin()
         signals, done = call.results(), 0
         demands, ended = signals.pop("demands"), signals.pop("ended")
@@ -106,7 +108,7 @@ def rollout_of(loop: Loop, attack: Attack) -> Rollout | Untraced:
     """Return the program of a loop under an attack, if it equals the plain loop on this machine; else the reason why there is none."""
     plan = attack.prepare(loop.brief)
     return _made.proved(
-        (loop, attack, plan),
+        (loop, attack, plan, device()),
         lambda: loop.sense(_begun(loop, attack, plan, _ONE).loop),
         lambda: Rollout(loop, attack, plan),
         lambda found, values: found.of(loop, attack, plan, values),
@@ -119,11 +121,14 @@ def _difference(rollout: Rollout, batch: int = ROWS) -> str:
     from tailgate.core import draws
 
     plain = rollout.begun(draws.keys("tune", range(batch)))
-    state = State(rollout.program, batch)
+    state = rollout.program.rows(batch)
     state.put(plain)
-    call = Call(rollout.program, state)
+    call = rollout.program.call(state, 2)  # the form that plays: several steps, of which each is one
     for step in range(min(TRIED, rollout.loop.horizon)):
-        results, found = call(), raised(lambda: rollout.plain(plain))  # noqa: B023
+        call.begin()
+        call.play(1)
+        results = {name: value[0] for name, value in call.results().items()}
+        found = raised(lambda: rollout.plain(plain))  # noqa: B023
         if isinstance(found, str):
             return "" if not results["demands"].all() else f"step {step + 1}: {found}"
         plain, wanted = found

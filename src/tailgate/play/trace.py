@@ -160,11 +160,16 @@ def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True, p
 def _player(loop: Loop, attack: Attack, steps: int) -> Player | None:
     """Return a function that plays this many steps faster than the plain loop, or None."""
     from tailgate.engine.agreement import Untraced
+    from tailgate.engine.cards import DeviceError, device
     from tailgate.play.commanded import commanded
     from tailgate.play.rollouts import rollout_of
 
-    if steps >= MANY and not isinstance(whole := rollout_of(loop, attack), Untraced):
+    here = device()
+    if (steps >= MANY or here != "cpu") and not isinstance(whole := rollout_of(loop, attack), Untraced):
         return whole.play
-    if (steps >= WORTH or loop.horizon >= LONG) and not isinstance(program := commanded(loop), Untraced):
-        return partial(program.play, attack)
+    if steps >= WORTH or loop.horizon >= LONG or here != "cpu":
+        if not isinstance(program := commanded(loop), Untraced):
+            return partial(program.play, attack)
+        if here != "cpu":
+            raise DeviceError("device", here, f"cpu: {program.why}")
     return None

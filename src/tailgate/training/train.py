@@ -25,6 +25,7 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, config_path, load_scenario
 from tailgate.core.schema import as_data, build, canonical, fields_of, override, read_yaml
 from tailgate.core.threat import KNOWLEDGE
+from tailgate.engine import cards
 from tailgate.envs.gym.actions import ActionSpec
 from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.envs.gym.rewards import Reward
@@ -36,7 +37,7 @@ from tailgate.training.trainings import Training, train_all
 
 ENVIRONMENT = (fields_of(ActionSpec) | fields_of(Reward) | {"frames": None}).keys() - {"gamma"}  # that `environment` may hold
 # fields that change no policy; those of CHOSEN do where the best rival teaches
-COMPARED = {"episodes", "first_episode", "white_box", "others", "workers"}
+COMPARED = {"episodes", "first_episode", "white_box", "others", "workers", "device"}
 CHOSEN = {"rivals", "select_episodes", "outcome"}
 LATER = {"demonstrations"}  # fields that joined when policies had been published: at its default such a field leaves no mark
 
@@ -73,6 +74,7 @@ class TrainConfig:
     first_episode: Count = param(0, "number of the first of them: another block has not been seen", if_any=True)
     select_episodes: Episodes = param(1024, "other episodes, that the best rival is chosen on: fewer choose by chance")
     workers: Workers = param(2, "processes, of the training seeds and of the comparison; change no result")
+    device: str | None = param(None, "device of the training's environments, cpu or cuda; changes no result", if_any=True)
     rivals: tuple[str, ...] = param((), "scripted attacks of equal knowledge and dose to compare with")
     white_box: tuple[str, ...] = param(("stealth:trigger=near,threshold=40",), "attacks that know more, shown next to the others")
     others: tuple[str, ...] = param(("none", "kf", "oracle"), "further defences that the attacks are played on")
@@ -121,6 +123,8 @@ def checked(data: dict[str, Any]) -> TrainConfig:
         data["settings"] = data.get("settings", {}) | others
     config = build(TrainConfig, data, "config")
     check_name(config.name)
+    if config.device is not None:
+        cards.checked(config.device)
     if config.outcome is not None and config.outcome not in METRICS:
         raise unknown("config.outcome", config.outcome, METRICS)
     shown = () if config.teacher in (None, "best") else (config.teacher,)
@@ -232,6 +236,8 @@ def train_together(
     """
     for config, _ in runs:
         check(config)
+        with cards.playing_on(config.device or "cpu"):  # a card that cannot play is found out now
+            pass
     with contextlib.ExitStack() as locks:
         for directory in sorted({config.directory for config, _ in runs}):
             locks.enter_context(alone(directory))

@@ -19,6 +19,7 @@ from tailgate.base.pool import Crew, say
 from tailgate.base.reading import load_json
 from tailgate.core.registry import Spec
 from tailgate.core.schema import as_data
+from tailgate.engine.cards import playing_on
 
 if TYPE_CHECKING:
     from tailgate.training.train import TrainConfig
@@ -87,6 +88,11 @@ def spent(path: Path) -> float:
 
 
 def _train(training: Training, report: Callable[[Progress], None]) -> Path:
+    with playing_on(training.config.device or "cpu"):
+        return _trained(training, report)
+
+
+def _trained(training: Training, report: Callable[[Progress], None]) -> Path:
     config, seed, resume, settings, environment, teacher = training
     module, directory = learner_of(config.learner), config.directory
     board = directory / "tensorboard" if config.tensorboard else None

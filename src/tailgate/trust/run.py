@@ -25,7 +25,9 @@ from tailgate.base.reading import lines_of, parse_json
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_scenario
 from tailgate.core.schema import as_data
+from tailgate.engine.cards import device
 from tailgate.evaluation.cells import cells_of, run_cell
+from tailgate.evaluation.devices import check_cells
 from tailgate.evaluation.rows import CLEAN, encode
 
 from .cells import Job, Row, check_cell, failed, single
@@ -107,7 +109,7 @@ def _read(path: Path) -> list[Row]:
 def _played(jobs: Sequence[Job], workers: int) -> Generator[Row]:
     """Play, and yield rows as they are finished. Imported code plays in a separate process."""
     foreign = any(Spec("defence", job.cell.defence).imports or Spec("attack", job.cell.attack).imports for job in jobs)
-    if not foreign and (workers == 1 or len(jobs) < 2):
+    if device() != "cpu" or (not foreign and (workers == 1 or len(jobs) < 2)):
         yield from map(check_cell, jobs)
         return
     died = "the process that played this cell died"
@@ -136,6 +138,7 @@ def check(
     )
     jobs, clean = of(suite), dataclasses.replace(suite, attacks=(CLEAN,), doses=suite.doses[:1])
     judging = [] if CLEAN in suite.attacks or formulas else of(clean)  # runs without an attack say whether detection counts
+    check_cells([job.cell for job in (*jobs, *judging)], workers)
     count = (len(jobs) + len(judging)) * most
     sizes.announce(count / sizes.EPISODES_A_SECOND / workers, 0.0, f"{count:,} runs")
     settings = {"runs": most, "rule": rule_data(rule), "unsafe": _plain(safe or SafeDistance()), "demands": _plain(asked or Demands())}

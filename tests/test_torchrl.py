@@ -1,0 +1,52 @@
+"""TorchRL's environment: its specs, rollouts with resets, and the values of the tensors below it."""
+
+from typing import Any
+
+import pytest
+
+from tailgate.base.errors import InputError
+
+from .card import HostCard, host_card, needs_compiler
+from .engines import short
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("torchrl")
+
+from torchrl.envs.utils import check_env_specs  # noqa: E402
+
+from tailgate.envs.torch import TailgateEnv, TensorVecEnv  # noqa: E402
+
+__all__ = ["host_card"]
+FOLLOWING = {"scenario": "gusty-stop-and-go-v0", "defence": "chi2_kf"}
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=needs_compiler)])
+@pytest.mark.parametrize("action", ["mode", "continuous"])
+def test_specs(action: str, device: str, host_card: HostCard) -> None:
+    check_env_specs(TailgateEnv(8, device=device, action=action, **FOLLOWING))
+
+
+def test_rollouts_reset_what_is_done(tmp_path: Any) -> None:
+    place = tmp_path / "short.yaml"
+    place.write_text(short("gusty-stop-and-go-v0"))
+    arguments = FOLLOWING | {"scenario": str(place), "action": "mode"}
+    env = TailgateEnv(8, **arguments)
+    env.set_seed(3)
+    torch.manual_seed(0)
+    found = env.rollout(150, break_when_any_done=False)
+    assert found["next", "done"].sum() >= 16 and found.batch_size == (8, 150)
+    plain = TensorVecEnv(8, autoreset="disabled", **arguments)
+    observation, _ = plain.reset(seed=3)
+    for t in range(150):
+        torch.testing.assert_close(found["observation"][:, t], observation, rtol=0, atol=0)
+        observation, reward, terminated, truncated, _ = plain.step(found["action"][:, t])
+        torch.testing.assert_close(found["next", "reward"][:, t, 0], reward.float(), rtol=0, atol=0)
+        over = terminated | truncated
+        assert torch.equal(found["next", "done"][:, t, 0], over)
+        if over.any():
+            observation, _ = plain.reset(mask=over)
+
+
+def test_what_it_refuses() -> None:
+    with pytest.raises(InputError, match="autoreset"):
+        TailgateEnv(8, autoreset="same_step", **FOLLOWING)
