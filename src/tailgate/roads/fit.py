@@ -60,8 +60,8 @@ def windows_of(settings: Settings) -> tuple[Windows, Windows]:
         cars = sum(key.startswith("speed") for key in columns)
         if cars < 2 or "gap1" not in columns:
             raise InputError("fit.traces", name, "a recording of a string: speeds of all cars and the gaps between them")
-        dt = float(np.median(np.diff(columns["t"])))
-        rates.add(round(dt, 6))
+        dt = round(float(np.median(np.diff(columns["t"]))), 6)
+        rates.add(dt)
         speed = np.stack([columns[f"speed{i}"] for i in range(1, cars + 1)], axis=1)
         gap = np.stack([columns[f"gap{i}"] for i in range(1, cars)], axis=1)
         size, first = round(settings.window / dt), round(begin / dt)
