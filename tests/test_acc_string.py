@@ -159,3 +159,35 @@ def test_components_that_do_not_fit_are_refused():
         make("sensor", "vehicle_radar").matrices(load_scenario("stop-and-go-v0").plant)
     with pytest.raises(InputError, match="acc_production: got '1 agents, 3 states'"):
         make("controller", "acc_production").prepare(load_scenario("stop-and-go-v0").brief().model)
+
+
+def test_a_string_is_shown_behind_its_leader(tmp_path):
+    """In pictures and on the page of a replay the leader is a car of its own, and the first agent is car 0."""
+    pytest.importorskip("pygame")
+    from tailgate.envs.gym.gymnasium_env import AdversaryEnv
+    from tailgate.envs.render.stage import stage_of
+    from tailgate.replay.episode import episode_of
+    from tailgate.replay.page import outcome
+    from tailgate.replay.replay import Filter, play
+
+    env = AdversaryEnv(scenario="road-string-v0", defence="kf", render_mode="rgb_array", viewer="plain", engine="plain")
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(0)
+    episodes = env.batch if hasattr(env, "batch") else env.episodes
+    stage = stage_of(episodes.seat.loop, episodes.state, None, 0)
+    assert [car.name for car in stage.cars] == ["leader", *(f"car {i}" for i in range(5))] and stage.cars[0].role == "leader"
+    assert [follower.agent for follower in stage.followers] == [0, 1, 2, 3, 4] and [f.car for f in stage.followers] == [1, 2, 3, 4, 5]
+    assert env.render().shape[2] == 3
+
+    from tailgate.cli import main
+    from tailgate.evaluation.rows import read_rows
+
+    rows = tmp_path / "rows.jsonl"
+    attack = "fdi:trigger=near,threshold=25,value=10"
+    assert main(["evaluate", "--scenario", "road-string-v0", "--defence", "kf", "--attack", attack, "--seeds", "8", "--out", str(rows)]) == 0
+    row = max(read_rows(rows), key=lambda row: row["crashed"])
+    replay = play(row, Filter())
+    data = episode_of(replay)
+    assert len(data["string"]["gap"]) == 5 and len(data["string"]["lead"]) == len(data["string"]["speed"][0])
+    assert row["crashed"] == 1.0 and "car 2 hit car 1" in outcome(replay)

@@ -31,7 +31,7 @@ def add(commands: Commands) -> None:
     command.add_argument("--out", required=True, metavar="PATH", help="the page: a file that ends in .html, or a directory")
     command.add_argument("--video", metavar="FILE", help="also a film: .gif, .webp or .mp4")
     command.add_argument("--export", action="append", default=[], metavar="FILE",
-                         help="also the episode: .csv, .parquet (needs tailgate[log]), or .xml of SUMO's car data (repeatable)")  # fmt: skip
+                         help="also the episode: .csv, .parquet (needs tailgate[log]), or .xml of SUMO's cars (repeatable)")  # fmt: skip
     command.add_argument("--viewer", default="auto", choices=["auto", "plain", "highway"], help="what the film is drawn with")
     command.add_argument("--size", metavar="WxH", help="of a film on the road, for example 480x160 [px]")
     command.add_argument("--json", action="store_true", help="print what was played and checked as JSON")
