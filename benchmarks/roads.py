@@ -53,14 +53,14 @@ def crashed(scenario: Scenario, defence: str, attack: str, dose: int, episodes: 
     return METRICS["crashed"](trace) > 0.0
 
 
-def harms(scenario: Scenario, attacks: Sequence[str], dose: int, episodes: int, defences: Sequence[str] = DEFENCES) -> dict[str, dict[str, list[int]]]:
-    """For each defence and attack the episodes with a collision, as 0 and 1."""
-    out: dict[str, dict[str, list[int]]] = {}
+def harms(scenario: Scenario, attacks: Sequence[str], dose: int, episodes: int, defences: Sequence[str] = DEFENCES) -> dict[str, dict[str, str]]:
+    """For each defence and attack the episodes with a collision, a 0 or 1 each."""
+    out: dict[str, dict[str, str]] = {}
     for defence in defences:
         held = {attack: crashed(scenario, defence, attack, dose, episodes) for attack in attacks}
-        out[defence] = {attack: hit.astype(int).tolist() for attack, hit in held.items() if hit is not None}
-        worst = max(out[defence], key=lambda attack: sum(out[defence][attack]))
-        print(f"  {scenario.name} dose {dose}: {defence} {sum(out[defence][worst])} of {episodes} under {worst}", file=sys.stderr, flush=True)
+        out[defence] = {attack: "".join(map(str, hit.astype(int))) for attack, hit in held.items() if hit is not None}
+        worst = max(out[defence], key=lambda attack: out[defence][attack].count("1"))
+        print(f"  {scenario.name} dose {dose}: {defence} {out[defence][worst].count('1')} of {episodes} under {worst}", file=sys.stderr, flush=True)
     return out
 
 
@@ -115,11 +115,11 @@ def part_order(options: argparse.Namespace) -> dict[str, Any]:
     return out
 
 
-def undamaged(held: dict[str, dict[str, list[int]]], rng: np.random.Generator | None = None) -> dict[str, float]:
+def undamaged(held: dict[str, dict[str, str]], rng: np.random.Generator | None = None) -> dict[str, float]:
     """The share of undamaged episodes under the worst attack, of each defence; with `rng` on resampled episodes."""
     out = {}
     for defence, attacks in held.items():
-        table = np.array(list(attacks.values()))
+        table = np.array([list(map(int, hits)) for hits in attacks.values()])
         pick = slice(None) if rng is None else rng.integers(0, table.shape[1], table.shape[1])
         out[defence] = 1.0 - float(table[:, pick].mean(axis=1).max())
     return out
