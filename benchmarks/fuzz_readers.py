@@ -9,6 +9,7 @@ import operator
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -349,6 +350,21 @@ ARGUMENTS = (
 )  # fmt: skip
 
 
+def _recorded(kind: str) -> list[bytes]:
+    """A car behind another for 30 samples."""
+    t = [round(0.1 * k, 1) for k in range(90)]
+    if kind == "openacc":
+        return [("Time,Speed1,Speed2,IVS1\n" + "\n".join(f"{x},20.0,20.0,{25 + 0.01 * i}" for i, x in enumerate(t))).encode()]
+    if kind == "ultra-av":
+        return [("Trajectory_ID,Time_Index,Speed_LV,Speed_FAV,Space_Gap\n" + "\n".join(f"1,{x},20.0,20.0,25.5" for x in t)).encode()]
+    if kind == "sumo-fcd":
+        place = '<vehicle id="{}" lane="a_0" pos="{}" speed="20.0"/>'
+        steps = (f'<timestep time="{x}">{place.format("b", 40 + 20 * x)}{place.format("a", 20 * x)}</timestep>' for x in t)
+        return [f'<?xml version="1.0"?><fcd-export>{"".join(steps)}</fcd-export>'.encode()]
+    lines = [{"type": kind, "rcvTime": x, "sender": 7, "pos": [20.0 * x + at, 0.0, 0.0], "spd": [20.0, 0.0, 0.0]} for x in t for kind, at in ((2, 0.0), (3, 30.0))]
+    return ["\n".join(json.dumps(line) for line in lines).encode()]
+
+
 def readers() -> dict[str, Reader]:
     """All of them by name."""
     cem, ppo = _cem_checkpoint(), _checkpoint("ppo", envs=4, rollout=4, batch_size=16)
@@ -369,6 +385,10 @@ def readers() -> dict[str, Reader]:
         Reader("search space", "yaml", "space.yaml", lambda: [SPACE], _call("training.tuning", "read_space", "space.yaml", "ppo", text=True),
                command=("tune", "--trials", "1", "--space", "{}", "out=runs")),
         Reader("speed profile", "csv", "profile.csv", lambda: [PROFILE], _profile),
+        *(
+            Reader(f"recording of {kind}", form, name, partial(_recorded, kind), _call("roads.readers", "read", name, kind, text=True))
+            for kind, form, name in (("openacc", "csv", "a.csv"), ("ultra-av", "csv", "a.csv"), ("sumo-fcd", "text", "a.xml"), ("veremi", "jsonl", "a.jsonl"))
+        ),
         Reader("rows", "jsonl", "rows.jsonl", _rows, _read_rows("rows.jsonl"), command=("leaderboard", "build", "--rows", "{}", "--out", "page")),
         Reader("compressed rows", "xz", "rows.jsonl.xz", _rows, _read_rows("rows.jsonl.xz"),
                command=("leaderboard", "build", "--rows", "{}", "--out", "page")),

@@ -256,9 +256,8 @@ class ProfilePlan(NamedTuple):
     speed: Array  # (K,) at k dt
 
 
-def read_profile(path: Path) -> tuple[Array, Array]:
-    """Return times [s] and speeds [m/s] of a CSV file with the header `t,v`, validated."""
-    where = "manoeuvre profile.path"
+def read_profile(path: Path, where: str = "manoeuvre profile.path") -> tuple[Array, Array]:
+    """Return times [s] and speeds [m/s] of a CSV file with the header `t,v`, validated; errors name the field `where`."""
     try:
         rows = list(csv.reader(read_bytes(path).decode("utf-8-sig").splitlines()))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -287,6 +286,18 @@ def read_profile(path: Path) -> tuple[Array, Array]:
     return np.array(times), np.array(speeds)
 
 
+def resampled(times: Array, speeds: Array, dt: float, steps: int) -> Array:
+    """Return the speeds (steps,) [m/s] at dt apart from the first time on, linear between samples and constant after the last."""
+    out: Array = np.interp(times[0] + dt * np.arange(steps), times, speeds)
+    return out
+
+
+def towards(wanted: Array, speed: Array, dt: float) -> Array:
+    """Return the acceleration [m/s^2] that leads to a speed [m/s] in one step, elementwise."""
+    out: Array = (wanted - speed) / dt
+    return out
+
+
 @register("manoeuvre", "profile")
 @dataclass(frozen=True)
 class Profile:
@@ -301,12 +312,10 @@ class Profile:
 
     def prepare(self, dt: float) -> ProfilePlan:
         times, speeds = read_profile(self.path)
-        steps = math.ceil((times[-1] - times[0]) / dt) + 2
-        return ProfilePlan(dt, np.interp(times[0] + dt * np.arange(steps), times, speeds))
+        return ProfilePlan(dt, resampled(times, speeds, dt, math.ceil((times[-1] - times[0]) / dt) + 2))
 
     def start(self, plan: ProfilePlan, draws: Draws) -> None:
         return None
 
     def accel(self, plan: ProfilePlan, state: None, k: Array, speed: Array, draws: Draws) -> tuple[None, Array]:
-        wanted = num.take(plan.speed, np.minimum(k + 1, len(plan.speed) - 1))
-        return None, (wanted - speed) / plan.dt
+        return None, towards(num.take(plan.speed, np.minimum(k + 1, len(plan.speed) - 1)), speed, plan.dt)

@@ -108,7 +108,7 @@ def test_every_part_of_the_address_gives_other_numbers():
     base = dict(seeds=[1], role=Role.SENSOR, step=3, purpose="train", episode=0)
     others = [{"role": role} for role in Role if role != Role.SENSOR]
     others += [{"purpose": p} for p in draws.PURPOSES if p != "train"]
-    others += [{"step": 4}, {"step": 0}, {"step": 2**32 - 1}, {"episode": 1}, {"episode": 2**31}]
+    others += [{"step": 4}, {"step": 0}, {"step": 2**32 - 1}, {"episode": 1}, {"episode": 2**29 - 1}]
     others += [{"seeds": [2]}, {"seeds": [2**40]}]
     sets = [_draws(**(base | change)).uniform((64,))[0] for change in [{}, *others]] + [_draws(**base).uniform((64,), tag=1)[0]]
     everything = np.concatenate(sets)

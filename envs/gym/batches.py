@@ -11,7 +11,7 @@ from tailgate.base import sizes
 from tailgate.base.errors import InputError, unknown
 from tailgate.base.pytree import leaves, with_leaves
 from tailgate.core import Array, Frame, View
-from tailgate.core.draws import Keys
+from tailgate.core.draws import Keys, counted
 from tailgate.core.loop import LoopState
 from tailgate.engine import cards
 from tailgate.engine.agreement import Untraced
@@ -116,7 +116,7 @@ class PlainEpisodes:
 
     @property
     def number(self) -> Array:
-        return self._state.keys.episode
+        return counted(self._state.keys.episode)
 
     def begin(self, keys: Keys) -> None:
         self.state = self.seat.loop.start(keys)
@@ -198,7 +198,7 @@ class TracedEpisodes:
 
     @property
     def number(self) -> Array:
-        return self._rows.state.get_leaf("loop.keys.episode")
+        return counted(self._rows.state.get_leaf("loop.keys.episode"))
 
     def begin(self, keys: Keys) -> None:
         self.rows = Rows(self.programs, len(keys.key), self._threads)

@@ -6,6 +6,8 @@ car ahead as it believes to be. Gaps between bumpers are to scale, cars are not.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from tailgate.core import Array, Frame
@@ -89,7 +91,9 @@ def _marks(canvas: Canvas, place: Place, attacked: Array, alarm: Array) -> None:
             canvas.alarm(middle + (size if both else 0.0), top - size, size)
 
 
-def _truth(canvas: Canvas, place: Place, gaps: Array, speeds: Array, attacked: Array, travelled: float) -> None:
+def _truth(
+    canvas: Canvas, place: Place, gaps: Array, speeds: Array, attacked: Array, travelled: float, names: Sequence[str]
+) -> None:  # fmt: skip
     canvas.text(MARGIN, HEADER + 16, "THE ROAD AS IT IS", GREY, SMALL)
     canvas.box(0, WHEELS, WIDTH, WHEELS + ROAD, LEADER)
     lane = WIDTH / DASHES
@@ -99,9 +103,9 @@ def _truth(canvas: Canvas, place: Place, gaps: Array, speeds: Array, attacked: A
     for i in reversed(range(len(gaps))):
         ink, middle = LEADER if i == 0 else ATTACK if attacked[i] else EGO, place.nose[i] - place.length / 2
         canvas.car(place.nose[i], WHEELS, ink, length=place.length)
-        name, speed = "leader" if i == 0 else f"car {i}", f"{speeds[i]:.1f} m/s"
+        name, speed = names[i], f"{speeds[i]:.1f} m/s"
         pitch = place.length + min(gaps[i : i + 2]) * place.scale  # to the next car
-        name = name if canvas.length(name, TINY) < pitch else str(i)
+        name = name if canvas.length(name, TINY) < pitch else name.removeprefix("car ") if i else str(i)
         for words, below, size in ((name, 27.0, SMALL), (speed, 42.0, TINY + 2)):
             if canvas.length(words, TINY) < pitch:
                 size = size if canvas.length(words, size) < pitch else TINY
@@ -111,7 +115,7 @@ def _truth(canvas: Canvas, place: Place, gaps: Array, speeds: Array, attacked: A
             _gap(canvas, place.tail[i - 1], place.nose[i], TRUE_LINE, metres(gaps[i]), INK, must=crowded)
 
 
-def _belief(canvas: Canvas, place: Place, gaps: Array, believed: Array, attacked: Array) -> None:
+def _belief(canvas: Canvas, place: Place, gaps: Array, believed: Array, attacked: Array, names: Sequence[str]) -> None:
     canvas.box(0, STRIP, WIDTH, HEIGHT, BELIEF_PALE)
     canvas.line(0, STRIP, WIDTH, STRIP, BELIEF, 1)
     canvas.line(0, GHOST_WHEELS, WIDTH, GHOST_WHEELS, BELIEF, 1, dash=3.0)
@@ -131,7 +135,7 @@ def _belief(canvas: Canvas, place: Place, gaps: Array, believed: Array, attacked
             way, lines = 1 if ghost > 0.0 else -1, lines + 1
             x = WIDTH - MARGIN if way > 0 else MARGIN
             canvas.head(x, GHOST_WHEELS - 10, way, BELIEF, 18.0)
-            words = f"car {i} is out of view: {metres(abs(believed[i] - gaps[i]))} off"
+            words = f"{names[i]} is out of view: {metres(abs(believed[i] - gaps[i]))} off"
             canvas.text(x - way * 24, GHOST_WHEELS - 5, words, BELIEF, SMALL, "rs" if way > 0 else "ls", ground=BELIEF_PALE)
     unit = next(size for size in (500.0, 200.0, 100.0, 50.0, 20.0, 10.0, 5.0, 2.0, 1.0) if size * place.scale < 120.0 or size == 1.0)
     canvas.gap(MARGIN, MARGIN + unit * place.scale, HEIGHT - 14, GREY)
@@ -141,19 +145,26 @@ def _belief(canvas: Canvas, place: Place, gaps: Array, believed: Array, attacked
 def draw(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Array:
     """Return (H, W, 3) uint8: row `row` after `frame`, or right after a reset."""
     scene = loop.plant.scene(loop.plan.plant, state.plant)
-    gaps, speeds = scene.gap[row], scene.speed[row]
+    gaps, speeds, believed = scene.gap[row], scene.speed[row], believed_gaps(loop, state, row)
     refused = frame is not None and bool(frame.k[row] + 1 == state.k[row]) and bool(frame.refused[row])
-    attacked = np.any(state.channel.last.target[row], axis=1)
+    attacked, alarm = np.any(state.channel.last.target[row], axis=1), state.estimate.alarm[row]
+    first = 1
+    if loop.model.followers[0]:  # the leader is no agent: it is drawn before them
+        first = 0
+        gaps, believed = (np.concatenate([[np.inf], values]) for values in (gaps, believed))
+        speeds = np.concatenate([scene.lead_speed[row, :1], speeds])
+        attacked, alarm = (np.concatenate([[False], values]) for values in (attacked, alarm))
     canvas, place = Canvas(), Place(gaps)
     header(canvas, loop, state, row, refused)
-    _belief(canvas, place, gaps, believed_gaps(loop, state, row), attacked)
-    _truth(canvas, place, gaps, speeds, attacked, float(scene.position[row, 0]))
-    _marks(canvas, place, attacked, state.estimate.alarm[row])
+    names = ["leader", *(f"car {i}" for i in range(first, len(gaps)))]
+    _belief(canvas, place, gaps, believed, attacked, names)
+    _truth(canvas, place, gaps, speeds, attacked, float(scene.position[row, 0]), names)
+    _marks(canvas, place, attacked, alarm)
     hit = np.flatnonzero(gaps <= 0.0)
     for i in hit:
         canvas.burst(place.nose[i], WHEELS - CAR_SHAPE * place.length / 2, max(10.0, place.length * 0.3))
     if len(hit):
-        words = f"COLLISION: car {', car '.join(map(str, hit[:3]))}"
+        words = f"COLLISION: {', '.join(names[i] for i in hit[:3])}"
         canvas.sign(min(max(place.nose[hit[0]] - 90.0, MARGIN), WIDTH - 260.0), HEADER + 20, words)
     ended_line(canvas, loop, state, frame, row)
     return canvas.done()

@@ -98,15 +98,19 @@ def _string(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Stag
     """Return a platoon: the leader first, bumper behind bumper."""
     scene = loop.plant.scene(loop.plan.plant, state.plant)
     gaps, speeds, nose, cars, followers = scene.gap[row], scene.speed[row], START + float(scene.position[row, 0]), [], []
+    led = bool(loop.model.followers[0])  # the leader is no agent
+    if led:
+        nose += max(float(gaps[0]), 0.0) + LENGTH
+        cars.append(Car(nose - LENGTH / 2.0, 0.0, 0.0, float(scene.lead_speed[row, 0]), "leader", "leader", crashed=bool(gaps[0] <= 0.0)))
     for i, v in enumerate(speeds.tolist()):
-        if i:
+        if i or led:
             nose -= LENGTH + max(float(gaps[i]), 0.0)
         hit = bool((gaps[i : i + 2] <= 0.0).any())
-        role, name = ("defended", f"car {i}") if i else ("leader", "leader")
+        role, name = ("defended", f"car {i}") if i or led else ("leader", "leader")
         cars.append(Car(nose - LENGTH / 2.0, 0.0, 0.0, v, role, name, crashed=hit))
-        if i:
+        if i or led:
             sign = "COLLISION" if gaps[i] <= 0.0 else ""
-            followers.append(_follower(loop, state, frame, row, i, i, max(float(gaps[i]), 0.0), False, sign))
+            followers.append(_follower(loop, state, frame, row, i, i + led, max(float(gaps[i]), 0.0), False, sign))
     watched = next((i for i, f in enumerate(followers) if loop.brief.granted[f.agent].any()), 0)  # may be attacked: always the same one
     return Stage(1, 0.0, 1.0, tuple(cars), tuple(followers), watched)
 

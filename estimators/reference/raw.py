@@ -34,13 +34,15 @@ class RawState(NamedTuple):
 def readings(model: Model) -> tuple[Reading, ...]:
     """Return what each agent reads and hears, in rounds.
 
-    Where two sensors read the same state, the later round counts, the own sensors last.
+    Where two sensors read the same state, the later round counts, the own sensors last. A late reading, of a state that only keeps what
+    another was, is taken for that other one.
 
     Raises NotApplicable where a sensor does not read one state directly.
     """
     if not (np.isin(model.C, (0.0, 1.0)).all() and (np.count_nonzero(model.C, axis=2) == 1).all()):
         raise NotApplicable("defence none", "this sensor matrix", "sensors that each read one state directly")
-    state = np.argmax(model.C, axis=2)
+    source = [_copied(model, column) for column in range(model.states)]
+    state = np.array(source)[np.argmax(model.C, axis=2)]
     rounds: list[list[tuple[int, int, int, int]]] = []
     for i in range(model.agents):
         told: dict[int, int] = {}  # how often each state was read
@@ -52,6 +54,16 @@ def readings(model: Model) -> tuple[Reading, ...]:
                     rounds.append([])
                 rounds[turn].append((i, column, j, s))
     return tuple(Reading(*np.array(each).T) for each in rounds)
+
+
+def _copied(model: Model, column: int) -> int:
+    """Return the state whose earlier value a state is; itself for most."""
+    for _ in range(model.states):
+        row = model.A[column]
+        if np.count_nonzero(row) != 1 or row.max() != 1.0 or row[column] or model.B[column].any() or model.c[column]:
+            return column
+        column = int(np.argmax(row))
+    return column
 
 
 @register("defence", "none")

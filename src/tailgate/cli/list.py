@@ -17,8 +17,9 @@ from tailgate.cli.shared import Commands, print_json
 
 def add(commands: Commands) -> None:
     """Add `list` to the commands."""
-    command = commands.add_parser("list", help="what there is: defences and their parts, attacks, the zoo, scenarios, suites; or a graph")
-    groups = ["defences", "filters", "detectors", "mitigations", "attacks", "zoo", "scenarios", "suites"]
+    about = "what there is: defences and their parts, attacks, the zoo, scenarios, suites, traces; or a graph"
+    command = commands.add_parser("list", help=about)
+    groups = ["defences", "filters", "detectors", "mitigations", "attacks", "zoo", "scenarios", "suites", "traces"]
     command.add_argument("what", nargs="?", choices=groups, help="only these; attacks: with the zoo of trained policies")
     command.add_argument("--graph", metavar="SCENARIO", help="draw who hears whom in this scenario instead (needs tailgate[viz])")
     command.add_argument("--out", metavar="FILE", help="the drawing: .png (default: SCENARIO.png), .svg or .pdf")
@@ -34,6 +35,8 @@ def _list(options: argparse.Namespace) -> int:
     from tailgate.agents.policy.zoo import zoo_card, zoo_names
     from tailgate.core.registry import entries
     from tailgate.core.scenario import list_scenarios, list_suites, load_scenario, load_suite
+    from tailgate.core.traces import as_card
+    from tailgate.core.traces import cards as trace_cards
 
     cards: dict[str, list[dict[str, Any]]] = {
         "defences": [entry.card() for entry in entries("defence").values()],
@@ -44,6 +47,7 @@ def _list(options: argparse.Namespace) -> int:
         "zoo": [zoo_card(name) for name in zoo_names()],
         "scenarios": [{"name": name, "summary": load_scenario(name).about} for name in list_scenarios()],
         "suites": [{"name": name, "summary": load_suite(name).about} for name in list_suites()],
+        "traces": [as_card(name) for name in trace_cards()],
     }
     wanted = ("attacks", "zoo") if options.what == "attacks" else (options.what,)
     chosen = {key: value for key, value in cards.items() if options.what is None or key in wanted}
@@ -54,6 +58,9 @@ def _list(options: argparse.Namespace) -> int:
     for title, group in chosen.items():
         if title == "zoo":
             out.print(_zoo_table(group))
+            continue
+        if title == "traces":
+            out.print(_trace_table(group))
             continue
         table = Table("name", "what it is", "parameters (default)", title=title)
         for card in group:
@@ -82,6 +89,16 @@ def _zoo_table(group: list[dict[str, Any]]) -> Table:
             f"{budget}\n{threat.get('fdi_bound', '-')}", card["knowledge"] + ("\n+ measurement" if threat.get("sees_measurement") else ""),
             outcome, card["sha256"][:12],
         )  # fmt: skip
+    return table
+
+
+def _trace_table(group: list[dict[str, Any]]) -> Table:
+    table = Table("name", "what it is", "columns", "length, rate", "licence", "source", title="traces: recorded drives")
+    for card in group:
+        size = f"{card['seconds']:.0f} s\n{card['rate']:g} Hz"
+        columns = ", ".join(card["columns"])
+        source = f"{card['source']}; {card['attribution']}"
+        table.add_row(*map(escape, (card["name"], card["summary"], columns, size, card["licence"], source)))
     return table
 
 

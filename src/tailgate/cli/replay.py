@@ -30,6 +30,8 @@ def add(commands: Commands) -> None:
     command.add_argument("--agent", type=int, metavar="N", help="the car or agent to look at first (default: the one attacked most)")
     command.add_argument("--out", required=True, metavar="PATH", help="the page: a file that ends in .html, or a directory")
     command.add_argument("--video", metavar="FILE", help="also a film: .gif, .webp or .mp4")
+    command.add_argument("--export", action="append", default=[], metavar="FILE",
+                         help="also the episode: .csv, .parquet (needs tailgate[log]), or .xml of SUMO's cars (repeatable)")  # fmt: skip
     command.add_argument("--viewer", default="auto", choices=["auto", "plain", "highway"], help="what the film is drawn with")
     command.add_argument("--size", metavar="WxH", help="of a film on the road, for example 480x160 [px]")
     command.add_argument("--json", action="store_true", help="print what was played and checked as JSON")
@@ -67,6 +69,10 @@ def _replay(options: argparse.Namespace) -> int:
         check_format(video)
     elif options.size is not None or options.viewer != "auto":
         raise InputError("--video", None, "a file: --viewer and --size are those of a film")
+    from tailgate.roads.export import check_path, write_episode
+
+    for file in options.export:
+        check_path(Path(file))
     viewer = Viewer(options.viewer, _size(options.size))
     defence = Spec("defence", options.defence or "none")
     if defence.imports or defence.sandboxed or Spec("attack", options.attack or "none").imports:
@@ -76,6 +82,7 @@ def _replay(options: argparse.Namespace) -> int:
     chosen = choose(read_rows(source), wanted)
     replay = play(chosen.row, wanted)
     page = write_page(replay, Path(options.out), f"line {chosen.line} of {source.name}", options.agent)
+    exports = [write_episode(replay.trace, Path(file)) for file in options.export]
     film = write_video(replay, video, viewer) if video is not None else None
     row = chosen.row
     report = {
@@ -85,6 +92,7 @@ def _replay(options: argparse.Namespace) -> int:
         "trace_hash": replay.checks[0].here, "decision_hash": replay.checks[1].here,
         "differences": [{"name": c.name, "row": c.row, "here": c.here} for c in replay.differences],
         "metrics": replay.metrics, "page": str(page), "video": str(video) if video is not None else None,
+        "exports": list(map(str, exports)),
     }  # fmt: skip
     if options.json:
         print_json(report)
@@ -109,5 +117,6 @@ def _print(report: dict[str, Any], film: str | None) -> None:
     ]  # fmt: skip
     if film is not None:
         lines.append(("video", film))
+    lines += [("export", path) for path in report["exports"]]
     for name, words in lines:
         say(f"{name:<8}{words}", soft_wrap=True)

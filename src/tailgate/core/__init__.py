@@ -1,6 +1,19 @@
 """Models, the threat model and its channel, the loop, random numbers, and the registry of components. The nouns are imported from here."""
 
-from tailgate.core.components import Attack, Controller, Defence, Manoeuvre, Plant, Receiver, Sensor, Sized, View, WhiteBox
+from tailgate.core.components import (
+    Attack,
+    Controller,
+    Defence,
+    Manoeuvre,
+    Paced,
+    Plant,
+    Receiver,
+    Recording,
+    Sensor,
+    Sized,
+    View,
+    WhiteBox,
+)
 from tailgate.core.kinds import AIRED, Kind, Mode
 from tailgate.core.nouns import (
     Air,
@@ -21,6 +34,7 @@ from tailgate.core.quantities import Count, Discount, Finite, NonNegative, Posit
 
 __all__ = [
     "AIRED", "Air", "Array", "Attack", "Command", "Controller", "Count", "Defence", "Discount", "Estimate", "Finite", "Frame",
-    "Innovation", "Kind", "Manoeuvre", "Mode", "Model", "NonNegative", "Plant", "Positive", "PositiveCount", "Prior", "Probability",
-    "Received", "Receiver", "Scene", "Sensor", "Sized", "View", "WhiteBox", "no_command", "pair_of", "param",
+    "Innovation", "Kind", "Manoeuvre", "Mode", "Model", "NonNegative", "Paced", "Plant", "Positive", "PositiveCount", "Prior",
+    "Probability", "Received", "Receiver", "Recording", "Scene", "Sensor", "Sized", "View", "WhiteBox",
+    "no_command", "pair_of", "param",
 ]  # fmt: skip

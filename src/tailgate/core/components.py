@@ -92,6 +92,14 @@ class Plant(Sized, Protocol[P, S]):
         """Return the speed (B,) of the vehicle that the manoeuvre drives [m/s]."""
 
 
+@runtime_checkable
+class Paced(Plant[P, S], Protocol[P, S]):
+    """A plant whose cars may begin an episode at any speed."""
+
+    def paced(self, plan: P, state: S, speed: Array) -> S:
+        """Return the state that `start` made, with all cars at a speed (B,) [m/s]."""
+
+
 class Sensor(Protocol[P]):
     """The sensors of every agent."""
 
@@ -169,6 +177,14 @@ class Manoeuvre(Protocol[P, S]):
 
     def accel(self, plan: P, state: S, k: Array, speed: Array, draws: Draws) -> tuple[S, Array]:
         """Return the next state and the leader's acceleration (B,) [m/s^2] at step k (B,), from its speed (B,) [m/s]."""
+
+
+@runtime_checkable
+class Recording(Manoeuvre[P, S], Protocol[P, S]):
+    """A manoeuvre that begins at a speed which differs from episode to episode. It needs a plant that is `Paced`."""
+
+    def first_speed(self, plan: P, state: S) -> Array:
+        """Return the leader's speed (B,) [m/s] at the start of the episode."""
 
 
 class Defence(Protocol[P, S]):

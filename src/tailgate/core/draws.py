@@ -3,6 +3,8 @@
 key = 64 bits of BLAKE2b(purpose, party, seed); counter = (episode, block, step, stream). A stream belongs to a ROLE, so
 swapping the defence or the attack leaves every other draw identical, and comparisons are paired. The three
 parties have unrelated keys: the draws of a defence or an attack say nothing about the sensor noise.
+
+The upper bits of an episode counter hold the purpose, for manoeuvres that keep recordings apart by it. No draw depends on these bits.
 """
 
 import hashlib
@@ -26,6 +28,8 @@ Array = NDArray[Any]
 Pair = Callable[..., tuple[Array, Array]]  # a function of key, episode, step, stream and block that gives two numbers
 PURPOSES = ("train", "tune", "calibrate", "select", "report")
 _PARTIES = ("world", "attack", "defence")
+_SHIFT = 29  # of the purpose in an episode counter: an environment plays fewer episodes in a row
+_COUNT = (1 << _SHIFT) - 1  # the other bits
 
 
 class Role(IntEnum):
@@ -54,8 +58,21 @@ class Keys(NamedTuple):
     episode: Array
 
     def at(self, role: Role, step: Array) -> "Draws":
-        """Return the draws of one role at each row's own step (B,)."""
-        return Draws(self.key[:, _party(role)], self.episode, step.astype(np.uint32), int(role))
+        """Return the draws of one role at each row's own step (B,). Only those of the world know the purpose."""
+        episode = counted(self.episode) if _party(role) else self.episode
+        return Draws(self.key[:, _party(role)], episode, step.astype(np.uint32), int(role))
+
+
+def counted(episode: Array) -> Array:
+    """Return the numbers of episodes (B,) from their counters, without the purpose."""
+    out: Array = episode & np.uint32(_COUNT)
+    return out
+
+
+def purpose_of(draws: "Draws") -> Array:
+    """Return the index in PURPOSES (B,) int64 of draws of the world."""
+    out: Array = draws.episode.astype(np.int64) >> np.int64(_SHIFT)
+    return out
 
 
 def keys(purpose: str, seeds: Sequence[int]) -> Keys:
@@ -67,7 +84,7 @@ def keys(purpose: str, seeds: Sequence[int]) -> Keys:
         for i, seed in enumerate(seeds):
             digest = hashlib.blake2b(f"{purpose}/{party}/{int(seed)}".encode(), digest_size=8).digest()
             out[p, i] = int.from_bytes(digest, "little")
-    return Keys(out.T, np.zeros(len(seeds), np.uint32))
+    return Keys(out.T, np.full(len(seeds), PURPOSES.index(purpose) << _SHIFT, np.uint32))
 
 
 @cache
@@ -88,12 +105,12 @@ class Draws(NamedTuple):
         size, batch = math.prod(shape), len(self.key)
         blocks, stream = (size + 1) // 2, np.uint64(self.stream << 16 | tag)
         if isinstance(self.key, Traced):
-            counters = self.key, self.episode.astype(np.uint64), self.step.astype(np.uint64), stream
+            counters = self.key, counted(self.episode).astype(np.uint64), self.step.astype(np.uint64), stream
             out = [number for block in range(blocks) for number in pair(*counters, np.uint64(block))][:size]
             held = np.stack(out, axis=-1) if out else np.zeros((batch, 0))
             return cast(Array, held.reshape(batch, *shape))
         given = np.empty((5, blocks, batch), np.uint64)
-        given[0], given[1], given[2], given[3], given[4] = self.key, self.episode, self.step, stream, np.arange(blocks)[:, None]
+        given[0], given[1], given[2], given[3], given[4] = self.key, counted(self.episode), self.step, stream, np.arange(blocks)[:, None]
         held = _code(pair)(given.reshape(5, -1)) if given.size else np.empty((2, 0))
         both = held.reshape(2, blocks, batch).swapaxes(0, 1).reshape(2 * blocks, batch)
         return num.last_to_first(both[:size].reshape(*shape, batch))

@@ -32,9 +32,11 @@ from tailgate.core import (
     Manoeuvre,
     Mode,
     Model,
+    Paced,
     Plant,
     Received,
     Receiver,
+    Recording,
     Sensor,
     View,
     WhiteBox,
@@ -168,10 +170,12 @@ class Loop:
         batch = len(keys.key)
         at_start = np.full(batch, START)
         plant = self.plant.start(plan.plant, keys.at(Role.PRIOR, at_start))
+        manoeuvre = self.manoeuvre.start(plan.manoeuvre, keys.at(Role.MANOEUVRE, at_start))
+        if isinstance(self.manoeuvre, Recording) and isinstance(self.plant, Paced):
+            plant = self.plant.paced(plan.plant, plant, self.manoeuvre.first_speed(plan.manoeuvre, manoeuvre))
         controller = self.controller.start(plan.controller, batch)
         held = self.controller.held(plan.controller, controller, batch)
         prior = self.plant.prior(plan.plant, plant, held, keys.at(Role.PRIOR, at_start))
-        manoeuvre = self.manoeuvre.start(plan.manoeuvre, keys.at(Role.MANOEUVRE, at_start))
         shape = (batch, model.agents)
         estimate = Estimate(
             prior.mean, num.zeros(shape), num.zeros(shape, bool), num.full(shape, Mode.NORMAL, np.int8), num.full(shape, True, bool)

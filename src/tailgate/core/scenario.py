@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from tailgate.base.errors import InputError, unknown
 from tailgate.base.reading import YAML_ENDS
 from tailgate.base.sizes import Episodes
-from tailgate.core import Defence, Positive, param
+from tailgate.core import Defence, Paced, Positive, Recording, param
 from tailgate.core.loop import Loop
 from tailgate.core.lossy_link import Link
 from tailgate.core.quantities import Fraction, Horizon
@@ -55,6 +55,9 @@ class Scenario:
         begins, drives = getattr(self.manoeuvre, "initial_speed", None), getattr(self.plant, "lead_speed", None)
         if begins is not None and drives is not None and abs(begins - drives) > 0.5:
             raise InputError(f"scenario {self.name}: plant.lead_speed", drives, f"the manoeuvre's first speed ({begins} m/s)")
+        if isinstance(self.manoeuvre, Recording) and not isinstance(self.plant, Paced):
+            wanted = "one whose cars may begin at any speed, as acc_string"
+            raise InputError(f"scenario {self.name}: plant", type(self.plant).__name__, wanted)
         if not loop.link.perfect and loop.model.air:
             raise InputError(where, self.truth, "no loss or latency: a radar is read where it hears")
         if told is not None and told.C.shape != plant.model(sensor, self.controller).C.shape:

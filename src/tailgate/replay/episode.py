@@ -221,6 +221,8 @@ def _everybody(replay: Replay, agents: list[int]) -> Data:
             "position": curve(_road(replay, "position", 0)),
             "believed": [curve(_believed_gap(replay, i)) if model.followers[i] else [] for i in cars],
         }  # fmt: skip
+        if model.followers[0]:  # the leader is no agent
+            out["string"]["lead"] = curve(_road(replay, "lead_speed", 0))
     else:
         places = layout(model.graph)
         low, wide = places.min(axis=0), np.ptp(places, axis=0)

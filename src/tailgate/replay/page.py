@@ -41,7 +41,7 @@ def outcome(replay: Replay) -> str:
     ahead, behind = "the car hit the one ahead", "the car behind hit the car"
     if model.agents > 1 and (step := first_step(trace.collided[:, 0])) is not None:
         car = int(np.argmin(trace.gap[step - 1, 0]))
-        ahead = f"car {car} hit {'the leader' if car == 1 else f'car {car - 1}'}"
+        ahead = f"car {car} hit {'the leader' if car == (0 if model.followers[0] else 1) else f'car {car - 1}'}"
     hits = [(trace.collided, ahead), (trace.rear_collided, behind)]
     found = [(what, at) for signal, what in hits if (at := first_step(signal[:, 0])) is not None]
     words = [f"{what} at t = {at * trace.dt:.4g} s (step {at})" for what, at in found]

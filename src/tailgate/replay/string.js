@@ -7,9 +7,11 @@ const drawString = (() => {
     const tools = makePen(canvas);
     if (!tools) return;
     const { pen, width, height, margin, small, large, metres, clamp, font, line, fitted, text, head, span, drawCar, burst, sign, bolt, lamp } = tools;
-    const { gap: gaps, speed, position, believed } = episode.string;
-    const count = gaps.length, gap = gaps.map((values) => values[s]);
-    const attacked = s ? episode.attacked[s - 1] : gap.map(() => 0), alarmed = s ? episode.alarms[s - 1] : gap.map(() => 0);
+    const { lead, position } = episode.string, led = lead ? 1 : 0; // led: the leader is no agent, and stands before them
+    const before = (first, values) => (led ? [first, ...values] : values), empty = lead ?? [];
+    const gaps = before(empty.map(() => null), episode.string.gap), speed = before(empty, episode.string.speed);
+    const believed = before(empty.map(() => null), episode.string.believed), count = gaps.length, gap = gaps.map((values) => values[s]);
+    const attacked = s ? before(0, episode.attacked[s - 1]) : gap.map(() => 0), alarmed = s ? before(0, episode.alarms[s - 1]) : gap.map(() => 0);
     const strip = Math.round(height * 0.56), trueLine = Math.round(strip * 0.3), wheels = Math.round(strip * 0.63), roadHeight = 10;
     const believedLine = strip + 24, ghostWheels = height - 30;
 
@@ -48,7 +50,7 @@ const drawString = (() => {
         const way = ghost > 0 ? 1 : -1, x = way > 0 ? width - margin : margin;
         told = true;
         head(x, ghostWheels - 10, way, BELIEF, 16);
-        text(x - way * 22, ghostWheels - 5, `car ${i} is out of view: ${metres(Math.abs(belief - gap[i]))} off`, { ink: BELIEF, anchor: way > 0 ? "r" : "l", room: [margin + 22, width - margin - 22], ground: BELIEF_PALE });
+        text(x - way * 22, ghostWheels - 5, `car ${i - led} is out of view: ${metres(Math.abs(belief - gap[i]))} off`, { ink: BELIEF, anchor: way > 0 ? "r" : "l", room: [margin + 22, width - margin - 22], ground: BELIEF_PALE });
       }
     }
     if (!s) text(width / 2, believedLine + 14, "nothing is measured before step 1", { ink: BELIEF, anchor: "m" });
@@ -60,7 +62,7 @@ const drawString = (() => {
     // the truth; the sign of a collision hides the words of the gaps behind it
     const hits = [...gap.keys()].filter((i) => i && gap[i] !== null && gap[i] <= 0);
     const behind = (x) => hits.some((i) => {
-      const length = fitted(`COLLISION: car ${i}`, large, true, [0, FAR]) + 2 * margin;
+      const length = fitted(`COLLISION: car ${i - led}`, large, true, [0, FAR]) + 2 * margin;
       return Math.abs(x - clamp(nose[i], 2 + length / 2, width - 2 - length / 2)) < length / 2 + 2 * small;
     });
     text(margin, small + 4, "THE ROAD AS IT IS", { ink: GREY });
@@ -74,11 +76,11 @@ const drawString = (() => {
       const ink = i === 0 ? LEADER : attacked[i] ? ATTACK : EGO, middle = nose[i] - car / 2;
       drawCar(nose[i], wheels, ink, false, car);
       const pitch = car + Math.min(i ? gap[i] : FAR, i + 1 < count ? gap[i + 1] : FAR) * scale;
-      const name = i === 0 ? "leader" : `car ${i}`, short = wide(name, 9) < pitch ? name : String(i);
+      const name = i === 0 ? "leader" : `car ${i - led}`, short = wide(name, 9) < pitch ? name : String(i - led);
       if (wide(short, 9) < pitch) text(middle, wheels + roadHeight + small + 2, short, { ink, size: wide(short, small) < pitch ? small : 9, anchor: "m", bold: true, room: [2, width - 2], ground: WHITE });
       const moves = `${speed[i][s].toFixed(1)} m/s`;
       if (wide(moves, 9) < pitch) text(middle, wheels + roadHeight + 2 * small + 4, moves, { ink, size: wide(moves, small - 1) < pitch ? small - 1 : 9, anchor: "m", room: [2, width - 2], ground: WHITE });
-      if (i === agent) line(nose[i] - car, wheels + roadHeight + 2, nose[i], wheels + roadHeight + 2, ink, 2); // the agent of the plots
+      if (i === agent + led) line(nose[i] - car, wheels + roadHeight + 2, nose[i], wheels + roadHeight + 2, ink, 2); // the agent of the plots
       const size = clamp(car / 5, 4, 8), top = wheels - tall - 3, both = attacked[i] && alarmed[i] ? size : 0;
       if (attacked[i]) bolt(middle - both, top, size);
       if (alarmed[i]) lamp(middle + both, top - size, size);
@@ -86,7 +88,7 @@ const drawString = (() => {
     }
     hits.forEach((i) => {
       burst(nose[i], wheels - tall / 2, Math.max(10, car * 0.3));
-      sign(nose[i], trueLine + 2, `COLLISION: car ${i}`, 2, width - 2);
+      sign(nose[i], trueLine + 2, `COLLISION: car ${i - led}`, 2, width - 2);
     });
   };
 })();

@@ -1,0 +1,268 @@
+# ruff: noqa: E501 - tables
+"""Real roads: the fit, false alarms on recordings, the time gap, and the order of defences on made-up and on recorded roads.
+
+    python benchmarks/roads.py [--out results/roads-v0] [--parts fit,alarms,order,gaps,aeb,speed] [--episodes 100]
+
+Each part writes PART.json into the folder, and a figure into docs/images with --figures. A part that has its file is not played again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import kendalltau, spearmanr
+
+from tailgate.base.errors import NotApplicable
+from tailgate.base.files import write_atomic
+from tailgate.base.plots import canvas, png
+from tailgate.core import draws
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import Scenario, load_scenario, load_suite
+from tailgate.evaluation.stats import mean_time
+from tailgate.play.metrics import METRICS
+from tailgate.play.trace import rollout
+from tailgate.roads import detect_log, fit
+from tailgate.roads.readers import read
+from tailgate.roads.replayed import Noise, cut, loop_over, rows
+
+ROOT = Path(__file__).parents[1]
+DEFENCES = ("none", "kf", "rkf", "imm", "chi2_kf", "chi2_kf_sparse", "windowed_chi2_kf", "cusum_kf", "mewma_kf", "reacquire_kf",
+            "cusum_reacquire_kf", "widen_kf", "brake_kf")  # fmt: skip
+DETECTORS = ("chi2_kf", "chi2_kf_sparse", "windowed_chi2_kf", "cusum_kf", "mewma_kf", "rkf", "imm")
+RECORDINGS = (("asta-string", "asta-braking"), ("comma2k19-radar",))  # of one rate each
+RESAMPLES = 2000
+
+
+def crashed(scenario: Scenario, defence: str, attack: str, dose: int, episodes: int) -> np.ndarray | None:
+    """Collisions (B,) of report episodes; None where the pairing has no meaning."""
+    guard, rival = Spec("defence", defence), Spec("attack", attack)
+    made = rival.make()
+    place = scenario.with_threat(budget=dose, knowledge=getattr(made, "knowledge", rival.entry.knowledge))
+    try:
+        trace = rollout(place.loop(guard.make(), guard.entry.uses), made, draws.keys("report", range(episodes)))
+    except NotApplicable:
+        return None
+    return METRICS["crashed"](trace) > 0.0
+
+
+def harms(scenario: Scenario, attacks: Sequence[str], dose: int, episodes: int, defences: Sequence[str] = DEFENCES) -> dict[str, dict[str, str]]:
+    """For each defence and attack the episodes with a collision, a 0 or 1 each."""
+    out: dict[str, dict[str, str]] = {}
+    for defence in defences:
+        held = {attack: crashed(scenario, defence, attack, dose, episodes) for attack in attacks}
+        out[defence] = {attack: "".join(map(str, hit.astype(int))) for attack, hit in held.items() if hit is not None}
+        worst = max(out[defence], key=lambda attack: out[defence][attack].count("1"))
+        print(f"  {scenario.name} dose {dose}: {defence} {out[defence][worst].count('1')} of {episodes} under {worst}", file=sys.stderr, flush=True)
+    return out
+
+
+def part_fit(options: argparse.Namespace) -> dict[str, Any]:
+    return fit.fit()
+
+
+def part_alarms(options: argparse.Namespace) -> dict[str, Any]:
+    """Thresholds of one false alarm an hour on the synthetic road, counted on recordings without an attack."""
+    out: dict[str, Any] = {"hours": 1.0, "defences": {}}
+    for names in RECORDINGS:
+        recordings = [(name, recording) for name in names for recording in read(name)]
+        dt = recordings[0][1].dt
+        for defence in DETECTORS:
+            try:
+                found = detect_log.at_hours(defence, dt, Noise(), 1.0, onsets=options.onsets)
+                bench = detect_log.Bench(Spec("defence", defence).make(), Spec("defence", defence).entry.uses, defence, (), 1, lambda *_: None)
+                guard = bench.at(found["threshold"])
+            except (NotApplicable, ValueError) as error:
+                out["defences"].setdefault(defence, {})[f"{dt:g}"] = {"left out": str(error)}
+                continue
+            alarms, hours, each = 0, 0.0, {}
+            for name, recording in recordings:
+                held = cut(recording, Noise(), None)
+                threat = detect_log.threat_of(detect_log.Settings(), dt, held.plant.gap.shape[1] - 1)
+                trace = rollout(loop_over(held, guard, bench.uses, threat), Spec("attack", "none").make(), rows(held))
+                row = detect_log.figures(detect_log.Played(recording.name, defence, "none", held, trace, detect_log.smoothed(held)), dt)
+                alarms, hours = alarms + row["alarms"], hours + row["hours"]
+                each[f"{name} {recording.name}".strip()] = {"alarms": row["alarms"], "hours": row["hours"], "alarm_share": row["alarm_share"]}
+            low, high = mean_time(alarms, hours)
+            out["defences"].setdefault(defence, {})[f"{dt:g}"] = {
+                "threshold": found["threshold"], "synthetic": found["measured"], "synthetic_fresh": found["fresh"], "alarms": alarms, "hours": hours,
+                "per_hour": alarms / hours, "low": 0.0 if high is None else 1.0 / high, "high": 1.0 / low, "recordings": each,
+            }  # fmt: skip
+            print(f"  {defence} at {dt:g} s: {alarms} alarms in {hours:.3f} h", file=sys.stderr, flush=True)
+    return out
+
+
+def part_order(options: argparse.Namespace) -> dict[str, Any]:
+    """Each defence under the scripts of its suite, on the synthetic 3 s road, and on recorded roads at 1.2 s with one and five cars."""
+    old, new = load_suite("car-following-v0"), load_suite("road-v0")
+    synthetic = load_scenario("gusty-stop-and-go-v0").with_threat(**old.threat)
+    black = [text for text in old.attacks if not Spec("attack", text).entry.learned and Spec("attack", text).entry.knowledge == "black"]
+    mine = [text for text in new.attacks if Spec("attack", text).entry.knowledge == "black"]
+    places = {
+        "synthetic": (synthetic, black, old.doses, options.episodes), "road": (load_scenario("road-following-v0"), mine, new.doses, options.episodes),
+        "string": (load_scenario("road-string-v0"), mine, new.doses, max(10, options.episodes // 2)),
+    }  # fmt: skip
+    out: dict[str, Any] = {"seconds": {"synthetic": [0.1 * d for d in old.doses], "road": [0.05 * d for d in new.doses]}, "attacks": {"synthetic": black, "road": mine}}
+    out["harm"] = {name: {str(dose): harms(place, attacks, dose, n) for dose in doses} for name, (place, attacks, doses, n) in places.items()}
+    out["summary"] = summary(out["harm"])
+    return out
+
+
+def undamaged(held: dict[str, dict[str, str]], rng: np.random.Generator | None = None) -> dict[str, float]:
+    """The share of undamaged episodes under the worst attack, of each defence; with `rng` on resampled episodes."""
+    out = {}
+    for defence, attacks in held.items():
+        table = np.array([list(map(int, hits)) for hits in attacks.values()])
+        pick = slice(None) if rng is None else rng.integers(0, table.shape[1], table.shape[1])
+        out[defence] = 1.0 - float(table[:, pick].mean(axis=1).max())
+    return out
+
+
+def scores(doses: dict[str, Any], rng: np.random.Generator | None = None) -> dict[str, float]:
+    """The mean over doses of what is undamaged."""
+    each = [undamaged(held, rng) for held in doses.values()]
+    return {defence: float(np.mean([part[defence] for part in each])) for defence in each[0]}
+
+
+def summary(harm: dict[str, Any]) -> dict[str, Any]:
+    """Scores, and rank correlations with intervals: over defences and episodes, both resampled."""
+    base = {name: scores(doses) for name, doses in harm.items()}
+    out: dict[str, Any] = {"scores": base, "correlation": {}}
+    for one, two in (("synthetic", "road"), ("synthetic", "string"), ("road", "string")):
+        names = list(base[one])
+        rng, drawn = np.random.default_rng(0), []
+        for _ in range(RESAMPLES):
+            a, b = scores(harm[one], rng), scores(harm[two], rng)
+            some = [names[i] for i in rng.integers(0, len(names), len(names))]
+            x, y = ([part[name] for name in some] for part in (a, b))
+            if len(set(x)) > 1 and len(set(y)) > 1:
+                drawn.append((spearmanr(x, y).statistic, kendalltau(x, y).statistic))
+        x, y = ([base[part][name] for name in names] for part in (one, two))
+        low, high = np.quantile(np.array(drawn), [0.025, 0.975], axis=0)
+        out["correlation"][f"{one}, {two}"] = {
+            "defences": len(names), "spearman": float(spearmanr(x, y).statistic), "spearman_interval": [float(low[0]), float(high[0])],
+            "kendall": float(kendalltau(x, y).statistic), "kendall_interval": [float(low[1]), float(high[1])],
+        }  # fmt: skip
+    return out
+
+
+def part_gaps(options: argparse.Namespace) -> dict[str, Any]:
+    """Collisions by time gap: the car of road-v0 at 0.8 to 3 s, under the worst script of the suite at each dose."""
+    suite, out = load_suite("road-v0"), {}
+    base = load_scenario("road-following-v0")
+    mine = [text for text in suite.attacks if Spec("attack", text).entry.knowledge == "black"]
+    for gap in (0.8, 1.2, 2.0, 3.0):
+        threshold = f"threshold={round(3.5 + 19.0 * gap)}"  # the median gap, as 25 m is at 1.2 s
+        attacks = [text.replace("threshold=25", threshold) for text in mine]
+        place = dataclasses.replace(base, controller=dataclasses.replace(base.controller, headway=gap), plant=dataclasses.replace(base.plant, time_gap=gap))
+        out[f"{gap:g}"] = {str(dose): {
+            defence: 1.0 - share for defence, share in undamaged(harms(place, attacks, dose, options.episodes, ("kf", "chi2_kf", "cusum_kf", "rkf"))).items()
+        } for dose in suite.doses}  # fmt: skip
+    return out
+
+
+def part_aeb(options: argparse.Namespace) -> dict[str, Any]:
+    """Collisions and emergency brakings without an emergency brake, on its own sensor, and on the attacked one."""
+    suite, out = load_suite("road-aeb-v0"), {}
+    for name in ("road-following-v0", "road-aeb-own-v0", "road-aeb-shared-v0"):
+        for defence in ("kf", "chi2_kf"):
+            for attack in suite.attacks:
+                guard, rival = Spec("defence", defence), Spec("attack", attack)
+                place = load_scenario(name).with_threat(budget=80)
+                trace = rollout(place.loop(guard.make(), guard.entry.uses), rival.make(), draws.keys("report", range(options.episodes)))
+                speed = METRICS["impact_speed"](trace)
+                out[f"{name}, {defence}, {attack}"] = {
+                    "collisions": float(METRICS["collided"](trace).mean()), "mean_impact_speed": float(np.nanmean(speed)) if np.isfinite(speed).any() else None,
+                    "brakings": float((np.where(trace.live[:, :, None], trace.signals["accel"], 0.0) < -5.5).any(axis=(0, 2)).mean()),
+                }  # fmt: skip
+    return out
+
+
+def part_speed(options: argparse.Namespace) -> dict[str, Any]:
+    """Million steps/s of random actions through the environment, 4096 episodes, one core; the median of three."""
+    import gymnasium
+
+    out = {}
+    for name in ("road-following-v0", "road-string-v0"):
+        for defence in ("kf", "chi2_kf", "cusum_kf"):
+            env = gymnasium.make_vec("tailgate:tailgate/CarFollowing-v0", num_envs=4096, scenario=name, defence=defence)
+            env.reset(seed=0)
+            rng, rates = np.random.default_rng(0), []
+            actions = [rng.integers(0, env.single_action_space.n, 4096) for _ in range(20)]
+            for _ in range(4):
+                begin = time.perf_counter()
+                for action in actions * 5:
+                    env.step(action)
+                rates.append(100 * 4096 / (time.perf_counter() - begin) / 1e6)
+            out[f"{name}, {defence}"] = {"engine": env.engine, "million_steps_a_second": float(np.median(rates[1:]))}
+    return out
+
+
+PARTS = {"fit": part_fit, "alarms": part_alarms, "order": part_order, "gaps": part_gaps, "aeb": part_aeb, "speed": part_speed}
+
+
+def draw_order(held: dict[str, Any]) -> bytes:
+    figure, axes = canvas(10.5, 4.8, 1, 2)
+    scored = held["summary"]["scores"]
+    for ax, other, title in zip(axes[0], ("road", "string"), ("recorded road at 1.2 s, one car", "five cars"), strict=True):
+        found = held["summary"]["correlation"][f"synthetic, {other}"]
+        names = list(scored["synthetic"])
+        x, y = ([100.0 * scored[part][name] for name in names] for part in ("synthetic", other))
+        ax.scatter(x, y, color="C0", s=22)
+        for i, name in enumerate(names):
+            ax.annotate(name, (x[i], y[i]), fontsize=7, xytext=(3, 3), textcoords="offset points")
+        low, high = found["spearman_interval"]
+        ax.set_title(f"{title}: rank correlation {found['spearman']:+.2f} [{low:+.2f}, {high:+.2f}]", fontsize=9)
+        ax.set(xlabel="undamaged on the synthetic 3 s road [%]", ylabel=f"undamaged, {title} [%]", xlim=(-5, 115), ylim=(-5, 105))
+        ax.grid(alpha=0.3)
+    return png(figure)
+
+
+def draw_gaps(held: dict[str, Any]) -> bytes:
+    figure, axes = canvas(10.5, 3.4, 1, 3, sharey=True)
+    for ax, dose in zip(axes[0], next(iter(held.values())), strict=True):
+        gaps = [float(gap) for gap in held]
+        for defence in held[next(iter(held))][dose]:
+            ax.plot(gaps, [100.0 * held[gap][dose][defence] for gap in held], marker="o", markersize=4, label=defence)
+        ax.set(xlabel="time gap [s]", title=f"{0.05 * int(dose):g} s of attack", ylim=(-3, 103))
+        ax.grid(alpha=0.3)
+    axes[0, 0].set_ylabel("collisions, worst script [%]")
+    axes[0, -1].legend(fontsize=8)
+    return png(figure)
+
+
+DRAWN = {"fit": ("roads-fit.png", fit.draw), "order": ("roads-order.png", draw_order), "gaps": ("roads-gaps.png", draw_gaps)}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--out", type=Path, default=ROOT / "results" / "roads-v0")
+    parser.add_argument("--parts", default=",".join(PARTS))
+    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--onsets", type=int, default=40, help="false alarms that a threshold is found on")
+    parser.add_argument("--figures", action="store_true", help="draw into docs/images")
+    options = parser.parse_args()
+    for name in options.parts.split(","):
+        path = options.out / f"{name}.json"
+        if path.is_file():
+            held = json.loads(path.read_text(encoding="utf-8"))
+        else:
+            begin = time.perf_counter()
+            held = PARTS[name](options)
+            write_atomic(path, json.dumps(held, indent=1).encode() + b"\n")
+            print(f"{path}: {time.perf_counter() - begin:.0f} s", file=sys.stderr)
+        if options.figures and name in DRAWN:
+            file, draw = DRAWN[name]
+            write_atomic(ROOT / "docs" / "images" / file, draw(held))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

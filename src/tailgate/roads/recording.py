@@ -1,0 +1,179 @@
+"""Recorded following: what a car read of the one ahead, validated, on a uniform grid of time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from tailgate.base.errors import InputError
+from tailgate.core import Array
+
+LEAST = 5.0  # shortest segment that is kept [s]
+RATE = (0.005, 2.0)  # admitted distance of samples [s]
+FASTEST = 100.0  # admitted speed [m/s]
+FARTHEST = 1000.0  # admitted gap [m]
+MISSING = 0.5  # largest share of missing readings
+REPEATED = 0.01  # largest share of repeated times
+BREAK = 1.5  # times the distance of samples: a longer one ends a segment
+MOST = 5_000_000  # samples
+
+
+class Raw(NamedTuple):
+    """The columns of a file, (K,) each: t [s], gap [m], relative speed (positive: opening) and own speed [m/s]; NaN: missing."""
+
+    name: str
+    t: Array
+    gap: Array
+    relative_speed: Array
+    speed: Array
+
+
+class Segment(NamedTuple):
+    """Samples dt [s] apart, (K,) each; `seen` is False where a reading is missing, and the values are then those before."""
+
+    begin: float  # [s]
+    gap: Array
+    relative_speed: Array
+    speed: Array
+    seen: Array
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One car behind another; `repairs` counts what was mended."""
+
+    name: str
+    dt: float
+    segments: tuple[Segment, ...]
+    repairs: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def samples(self) -> int:
+        return sum(len(part.gap) for part in self.segments)
+
+    @property
+    def hours(self) -> float:
+        return self.samples * self.dt / 3600.0
+
+
+def checked(raw: Raw, where: str) -> Recording:
+    """Return the recording on a uniform grid. Repairs are counted; what is not one of them is refused.
+
+    Repeated times are dropped (up to 1 %), missing or impossible readings are marked, samples that jitter are interpolated, a hole in
+    time ends a segment, and segments below 5 s are dropped.
+
+    Raises
+    ------
+    InputError
+        Too few samples, times that go back or do not end, own speeds that are missing, or units that cannot be meant. It names `where`,
+        the recording and the column.
+    """
+    name = f"{where}: {raw.name}" if raw.name else where
+    repairs: dict[str, int] = {}
+    t = raw.t
+    if len(t) < 20:
+        raise InputError(f"{name}: samples", len(t), "at least 20")
+    if len(t) > MOST:
+        raise InputError(f"{name}: samples", len(t), f"at most {MOST}")
+    if not np.isfinite(t).all():
+        raise InputError(f"{name}: time", f"{int((~np.isfinite(t)).sum())} that are no number", "a time [s] in every sample")
+    step = np.diff(t)
+    if (step < 0.0).any():
+        at = int(np.argmax(step < 0.0))
+        raise InputError(f"{name}: time", float(t[at + 1]), f"a time not before {float(t[at])}")
+    again = np.concatenate([[False], step == 0.0])
+    if again.any():
+        if again.sum() > max(1, REPEATED * len(t)):
+            raise InputError(f"{name}: time", f"{int(again.sum())} repeated", f"at most {REPEATED:.0%} of the {len(t)} samples")
+        repairs["repeated times dropped"] = int(again.sum())
+        raw = Raw(raw.name, *(column[~again] for column in raw[1:]))
+        t, step = raw.t, np.diff(raw.t)
+    dt = round(float(np.median(step)), 6)
+    if not RATE[0] <= dt <= RATE[1]:
+        raise InputError(f"{name}: time between samples", dt, f"{RATE[0]:g} to {RATE[1]:g} s; is the unit a second?")
+    raw = _possible(raw, name, repairs)
+    holes = np.flatnonzero(step > BREAK * dt) + 1
+    if len(holes):
+        repairs["holes in time"] = len(holes)
+    segments = []
+    for part in np.split(np.arange(len(t)), holes):
+        if (part[-1] - part[0]) * dt < LEAST:
+            repairs["samples of short segments dropped"] = repairs.get("samples of short segments dropped", 0) + len(part)
+            continue
+        segments.append(_uniform(raw, part, dt, repairs))
+    if not segments:
+        raise InputError(f"{name}: time", f"{len(holes)} holes", f"a segment of {LEAST:g} s without a hole above {BREAK:g} times {dt:g} s")
+    out = Recording(raw.name, dt, tuple(segments), repairs)
+    _meant(out, name)
+    return out
+
+
+def _possible(raw: Raw, name: str, repairs: dict[str, int]) -> Raw:
+    """Return the columns with impossible readings marked as missing; refuse own speeds that are missing, and impossible units."""
+    speed = raw.speed
+    if not np.isfinite(speed).all():
+        raise InputError(f"{name}: own speed", f"{int((~np.isfinite(speed)).sum())} that are no number", "a speed [m/s] in every sample")
+    if (speed < -1.0).any() or (speed > FASTEST).any():
+        worst = float(speed[np.argmax(np.abs(speed))])
+        raise InputError(f"{name}: own speed", worst, f"0 to {FASTEST:g} m/s; is the unit m/s?")
+    gap, relative = raw.gap.copy(), raw.relative_speed.copy()
+    known = np.isfinite(gap)
+    if (gap[known] > FARTHEST).any():
+        raise InputError(f"{name}: gap", float(gap[known].max()), f"at most {FARTHEST:g} m; is the unit a metre?")
+    if (np.abs(relative[np.isfinite(relative)]) > FASTEST).any():
+        raise InputError(f"{name}: relative speed", float(np.nanmax(np.abs(relative))), f"at most {FASTEST:g} m/s; is the unit m/s?")
+    missing = ~known | ~np.isfinite(relative)
+    if missing.any():
+        repairs["readings that are no number"] = int(missing.sum())
+    no_car = ~missing & (gap <= 0.0)
+    if no_car.any():
+        repairs["gaps not above 0"] = int(no_car.sum())
+    lost = missing | no_car
+    if lost.sum() > MISSING * len(gap):
+        raise InputError(f"{name}: gap", f"{int(lost.sum())} of {len(gap)} missing", f"at most {MISSING:.0%} missing or not above 0")
+    gap[lost] = relative[lost] = np.nan
+    return Raw(raw.name, raw.t, gap, relative, np.maximum(speed, 0.0))
+
+
+def _uniform(raw: Raw, part: Array, dt: float, repairs: dict[str, int]) -> Segment:
+    """Return the samples of a segment on a grid of dt [s]."""
+    t = raw.t[part]
+    count = round(float((t[-1] - t[0]) / dt)) + 1
+    grid = t[0] + dt * np.arange(count)
+    even = count == len(t) and bool(np.abs(t - grid).max() <= 1e-6 + 0.02 * dt)
+    columns = [raw.gap[part], raw.relative_speed[part], raw.speed[part]]
+    if not even:
+        repairs["samples interpolated to even times"] = repairs.get("samples interpolated to even times", 0) + count
+        columns = [np.interp(grid, t, column) for column in columns]  # a missing neighbour leaves NaN
+    gap, relative, speed = columns
+    seen = np.isfinite(gap) & np.isfinite(relative)
+    return Segment(float(t[0]), _kept(gap, seen), _kept(relative, seen), speed, seen)
+
+
+def _kept(values: Array, seen: Array) -> Array:
+    """Return values (K,) with the last one seen in place of what is missing; before the first, that."""
+    at = np.maximum.accumulate(np.where(seen, np.arange(len(values)), -1))
+    return np.asarray(values[np.where(at < 0, int(np.argmax(seen)) if seen.any() else 0, at)]) if seen.any() else np.zeros(len(values))
+
+
+def _meant(recording: Recording, name: str) -> None:
+    """Refuse a relative speed that is not the gap's rate: another sign or unit."""
+    rate, told = [], []
+    for part in recording.segments:
+        wide = max(1, round(1.0 / recording.dt))  # over a second: noise of a difference hides the rate
+        if len(part.gap) <= wide:
+            continue
+        both = part.seen[wide:] & part.seen[:-wide]
+        total = np.concatenate([[0.0], np.cumsum(0.5 * (part.relative_speed[1:] + part.relative_speed[:-1]) * recording.dt)])
+        rate.append((part.gap[wide:] - part.gap[:-wide])[both])
+        told.append((total[wide:] - total[:-wide])[both])
+    x, y = np.concatenate([np.zeros(0), *told]), np.concatenate([np.zeros(0), *rate])
+    if len(x) < 20 or x.std() < 0.05:  # nobody moves against the other
+        return
+    slope = float(np.dot(x, y) / np.dot(x, x))
+    if slope < -0.5:
+        raise InputError(f"{name}: relative speed", f"{slope:.2f} times the gap's rate", "one that is positive where the gap grows")
+    if not 0.4 <= slope <= 2.5 and np.corrcoef(x, y)[0, 1] > 0.8:
+        raise InputError(f"{name}: relative speed", f"the gap's rate over {slope:.2f}", "the gap's rate; are the units m and m/s?")

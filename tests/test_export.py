@@ -1,0 +1,105 @@
+"""An episode as CSV, Parquet and SUMO's floating car data: the numbers of the trace, which the field's readers read back."""
+
+import csv
+import io
+import json
+
+import numpy as np
+import pytest
+
+from tailgate.base.errors import InputError
+from tailgate.cli import main
+from tailgate.core import draws
+from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
+from tailgate.play.trace import rollout
+from tailgate.roads.export import cars_of, exported, table_of, write_episode
+from tailgate.roads.readers import Choice, mapping_of, read
+
+PLACES = {"road-string-v0": "fdi:start_step=105,value=5", "gusty-stop-and-go-v0": "fdi:start_step=60,value=-3", "platoon-gusty-v0": "fdi:start_step=60,value=5",
+          "radar-following-v0": "noise_jam:start_step=15"}  # fmt: skip
+
+
+def _trace(name, steps=150):
+    scenario, guard = load_scenario(name), Spec("defence", "chi2_kf")
+    loop = scenario.loop(guard.make(), guard.entry.uses)
+    object.__setattr__(loop, "horizon", min(steps, scenario.horizon))
+    return rollout(loop, Spec("attack", PLACES.get(name, "none")).make(), draws.keys("tune", range(2)))
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_a_table_holds_the_numbers_of_the_trace(name):
+    trace = _trace(name)
+    cars, table = cars_of(trace, 1), table_of(trace, 1)
+    n, model = int(trace.length[1]), trace.model
+    assert {len(column) for column in table.values()} == {n * len(cars.names)}
+    i = int(np.argmax(model.followers))
+    mine = table["vehicle"] == f"agent{i}"
+    assert np.array_equal(table["t"][mine], model.dt * np.arange(n))
+    assert np.array_equal(table["gap"][mine][1:], trace.signals["gap"][: n - 1, 1, i])
+    assert np.array_equal(table["speed"][mine][1:], trace.signals["speed"][: n - 1, 1, i])
+    attacked = (trace.kind[:n, 1] != 0) & trace.target[:n, 1, i].any(axis=1)
+    assert np.array_equal(table["attack"][mine] != "none", attacked) and (table["attack"] != "none").any()
+    assert np.array_equal(table["alarm"][mine] == 1.0, trace.alarm[:n, 1, i])
+    off = model.gap_error(trace.estimate[:n, 1], trace.truth[:n, 1])[:, i]
+    believed = table["believed_gap"][mine]
+    if name == "road-string-v0":
+        assert np.abs(believed - table["gap"][mine] - off).max() < 1e-9
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_cars_of_a_lane_are_a_car_and_a_gap_apart(name):
+    cars = cars_of(_trace(name))
+    assert np.nanmax(np.abs(cars.place[:, :-1] - cars.place[:, 1:] - 5.0 - cars.gap[:, 1:])) < 1e-9
+    assert cars.names[0] == ("agent0" if name.startswith("platoon") else "leader")
+
+
+def test_floating_car_data_is_read_back(tmp_path):
+    trace = _trace("road-string-v0", 400)
+    path = write_episode(trace, tmp_path / "a.xml")
+    found = read(str(path), choice=Choice("agent2", "agent1"))[0]
+    part = found.segments[0]
+    assert found.dt == pytest.approx(0.05) and found.samples == int(trace.length[0])
+    assert np.abs(part.gap[1:] - trace.signals["gap"][:-1, 0, 2]).max() < 2e-3
+    assert np.abs(part.speed[1:] - trace.signals["speed"][:-1, 0, 2]).max() < 1e-4
+
+
+def test_csv_is_read_back(tmp_path):
+    trace = _trace("road-following-v0", 400)
+    rows = list(csv.DictReader(io.StringIO(exported(trace, ".csv").decode())))
+    mine = [row for row in rows if row["vehicle"] == "agent0"]
+    assert [float(row["gap"]) for row in mine[1:]] == trace.signals["gap"][:-1, 0, 0].tolist()
+    assert all(row["received_distance"] == "" for row in rows if row["vehicle"] == "leader")
+    path = tmp_path / "one.csv"
+    lead = [float(row["speed"]) for row in rows if row["vehicle"] == "leader"]
+    path.write_text("t,gap,own,lead\n" + "\n".join(f"{row['t']},{row['gap']},{row['speed']},{v!r}" for row, v in zip(mine, lead, strict=True)))
+    found = read(str(path), choice=Choice(mapping=mapping_of(["t=t", "gap=gap", "speed=own", "lead_speed=lead"])))[0]
+    assert np.abs(found.segments[0].gap[1:] - trace.signals["gap"][:-1, 0, 0]).max() == 0.0
+
+
+def test_parquet_is_read_back(tmp_path):
+    pq = pytest.importorskip("pyarrow.parquet")
+    trace = _trace("road-string-v0")
+    held = pq.read_table(write_episode(trace, tmp_path / "a.parquet"))
+    want = table_of(trace)
+    for name in want:
+        got = held[name].to_numpy(zero_copy_only=False)
+        assert np.array_equal(got, want[name]) if want[name].dtype == object else np.array_equal(got.astype(float), want[name], equal_nan=True)
+    assert held["received_distance"].null_count > 0  # the leader has no radar
+
+
+def test_a_network_has_no_road():
+    with pytest.raises(InputError, match="a system without a road"):
+        cars_of(_trace("network-noisy-v0", 30))
+
+
+def test_the_command(tmp_path, capsys):
+    rows, out = tmp_path / "rows.jsonl", tmp_path / "page.html"
+    assert main(["evaluate", "--scenario", "road-following-v0", "--defence", "kf", "--attack", "fdi:start_step=105,value=10", "--seeds", "2", "--out", str(rows)]) == 0
+    capsys.readouterr()
+    files = [str(tmp_path / f"a{suffix}") for suffix in (".csv", ".xml")]
+    assert main(["replay", str(rows), "--out", str(out), "--json", *(part for file in files for part in ("--export", file))]) == 0
+    held = json.loads(capsys.readouterr().out)
+    assert held["exports"] == files and held["verdict"] == "same" and all((tmp_path / f"a{suffix}").stat().st_size > 1e4 for suffix in (".csv", ".xml"))
+    assert main(["replay", str(rows), "--out", str(out), "--export", "a.txt"]) == 2
+    assert "--export: got 'a.txt'; expected a file that ends in .csv, .xml, .parquet" in capsys.readouterr().err
