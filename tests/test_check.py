@@ -15,6 +15,7 @@ import tailgate
 from tailgate.base.errors import InputError
 from tailgate.board.check import check, with_check
 from tailgate.board.consistency import strays
+from tailgate.board.files import board_in, load
 from tailgate.board.score import score
 from tailgate.cli import check as command
 from tailgate.core.scenario import load_suite
@@ -66,9 +67,9 @@ def published() -> Data:
     return board
 
 
-@pytest.mark.parametrize("name", sorted(path.parent.name for path in ROOT.glob("results/*/board.json")))
+@pytest.mark.parametrize("name", sorted(path.parent.name for path in ROOT.glob("results/*/board.json*")))
 def test_what_is_published_follows_from_its_cells(name: str) -> None:
-    board = json.loads((ROOT / f"results/{name}/board.json").read_text(encoding="utf-8"))
+    board = load(board_in(ROOT / f"results/{name}"))
     assert strays(board, load_suite(name)) == []
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tailgate.base.errors import InputError
-from tailgate.board.files import read_board
+from tailgate.board.files import board_in, load, read_board
 from tailgate.board.run import VERIFIED, board_of
 from tailgate.cli import verify as command
 from tailgate.core.scenario import Suite, list_suites, load_suite
@@ -22,7 +22,7 @@ from tailgate.training.train import TrainConfig, plan_key
 
 ROOT = Path(__file__).parents[1]
 SUITE = Suite("small", "", ("thesis-ch4-v0",), (5,), ("none", "kf"), ("none", "fdi:value=5"), 4)
-BOARDS = sorted(path.parent.name for path in (ROOT / "results").glob("*/board.json"))
+BOARDS = sorted(path.parent.name for path in (ROOT / "results").glob("*/board.json*"))
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +125,7 @@ def test_a_report_that_is_none_is_named(rows: list[dict[str, Any]], tmp_path: Pa
 def test_a_published_board_is_of_the_suite_that_is_here(name: str) -> None:
     """A suite that changed leaves its board behind until its rows are played again."""
     assert name in list_suites()
-    board = json.loads((ROOT / f"results/{name}/board.json").read_text(encoding="utf-8"))
+    board = load(board_in(ROOT / f"results/{name}"))
     assert board["suite"]["hash"] == load_suite(name).hash
     for entry in read_board(board).entries:
         again = entry.checked
@@ -135,12 +135,12 @@ def test_a_published_board_is_of_the_suite_that_is_here(name: str) -> None:
 @pytest.mark.parametrize("name", BOARDS)
 def test_no_figure_of_a_published_board_rests_on_a_policy_that_is_not_here(name: str) -> None:
     """The worst of rates, critical doses and robustness rows, and worst episodes, can be played by whoever clones."""
-    board = json.loads((ROOT / f"results/{name}/board.json").read_text(encoding="utf-8"))
+    board = load(board_in(ROOT / f"results/{name}"))
     named = set()
     for entry in board["entries"]:
         worst = [*entry["rates"], *(dose for dose in entry["critical_dose"].values() if dose), *entry["robustness"]]
         named |= {one["worst"]["attack"] for one in worst} | ({entry["worst_episode"]["attack"]} if entry["worst_episode"] else set())
-    files = [attack for attack in named if attack.endswith(".json")]
+    files = [attack.partition("path=")[2] or attack for attack in named if attack.endswith((".json", ".yaml"))]
     assert named and all((ROOT / file).is_file() for file in files)
 
 
@@ -148,7 +148,7 @@ def test_no_figure_of_a_published_board_rests_on_a_policy_that_is_not_here(name:
 EARLIER = {"radar-v0": {"1ea5def9aee4fb47", "20e6fc0e71aa5875", "49a9e01c935738ac", "7ea5b769dc8e2028"}}
 
 
-@pytest.mark.parametrize("name", [name for name in BOARDS if (ROOT / f"results/{name}/attacked").is_dir()])
+@pytest.mark.parametrize("name", [name for name in BOARDS if (ROOT / f"results/{name}/attacked/policies").is_dir()])
 def test_published_attackers_are_those_that_the_suite_asks_for(name: str) -> None:
     """A change of the fields of a training, or of a suite's plan, would leave every defence unattacked; those of an earlier plan are told."""
     asked = {(want.plan, want.seed) for want in asked_of(load_suite(name))}

@@ -16,7 +16,7 @@ def title(board: Board) -> str:
     """Return suite, episodes, and whose seeds they are."""
     suite = board["suite"]
     seeds = f"seeds of the beacon {suite['beacon']}" if suite["beacon"] else "public seeds: for development"
-    free = "" if suite.get("require_adaptive", True) else ", ranked without attackers that were trained against each"
+    free = "" if suite.get("require_adaptive", True) else ", ranked without attackers made against each"
     return f"{suite['name']}, {suite['episodes']} episodes a cell, black box, {seeds}{free}"
 
 
@@ -54,7 +54,8 @@ def markdown(board: Board, most: int | None = None) -> str:
     """Return the head as a Markdown table of at most this many defences; a column with nothing in it is left out."""
     heading, *body = lines(board)
     heading = tuple(f"{text}, black box" if text.startswith(("critical", "undamaged")) else text for text in heading)
-    told = [i for i in range(len(heading)) if any(line[i] for line in body[:most])]
+    one = len(board["suite"]["doses"]) == 1  # then a critical dose says no more than the share
+    told = [i for i, text in enumerate(heading) if any(line[i] for line in body[:most]) and not (one and text.startswith("critical"))]
     rows = [[line[i].replace("|", "\\|") for i in told] for line in (heading, *body[:most])]
     rows.insert(1, ["---"] * len(told))
     return "\n".join(f"| {' | '.join(cells)} |" for cells in rows) + "\n"

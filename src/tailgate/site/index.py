@@ -280,7 +280,7 @@ def section(suite: Suite, measured: Attachments) -> Data:
     return {
         "suite": board.suite, "round": suite.round, "checked": checked_of(suite),
         "trust": trust_of(suite), "damage": suite.damage, "folder": suite.folder,
-        "count": len(rows), "doses": doses, "measures": measures.columns_of(suite),
+        "count": len(rows), "several": len(board.suite.doses) > 1, "doses": doses, "measures": measures.columns_of(suite),
         "all_doses": ", ".join(dose_text(d) for d in board.suite.doses), "limit": percent(board.suite.limit),
         "groups": [g for g in groups if g["rows"]], "classes": sorted({r["class"] for r in rows}),
         "statuses": [s for s, *_ in GROUPS if any(r["status"] == s for r in rows)], "levels": LEVELS,
