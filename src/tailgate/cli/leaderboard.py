@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from tailgate.cli import admit, attack, board, check, clock, detect, gap, retrain, schedules, submit, trial, verify
+from tailgate.cli import admit, attack, board, check, clock, detect, export, gap, retrain, schedules, submit, trial, verify
 from tailgate.cli.shared import Commands, add_options
 
 
@@ -13,7 +13,7 @@ def add(commands: Commands) -> None:
     """Add `leaderboard` to the commands."""
     command = commands.add_parser("leaderboard", help="score suites, attack and submit defences, verify rows, build pages")
     actions = command.add_subparsers(required=True, metavar="ACTION")
-    for action in (board, trial, attack, submit, verify, check, detect, clock, gap, schedules, retrain, admit):
+    for action in (board, trial, attack, submit, verify, check, detect, clock, gap, schedules, retrain, admit, export):
         action.add(actions)
     build = actions.add_parser("build", help="one self-contained HTML page from rows files, without gates and limits of a board")
     build.add_argument("--rows", nargs="+", required=True, metavar="FILE", help="JSON Lines files of `tailgate evaluate`")
