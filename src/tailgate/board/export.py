@@ -111,7 +111,7 @@ def _figure(board: Data, form: str, most: int | None) -> bytes:
     axes.set(xlabel="dose [attacked steps]", ylabel="damaged episodes [%]", ylim=(-2, 102), title=f"{held.suite.name}, black box")
     axes.grid(alpha=0.3)
     if entries:
-        axes.legend(fontsize="small")
+        figure.legend(fontsize="small", loc="outside right upper")
     out = io.BytesIO()
     metadata = {"Date": None} if form == "svg" else {"CreationDate": None, "Creator": None, "Producer": None}
     import matplotlib

@@ -56,8 +56,8 @@ def build_site(
 ) -> Path:  # fmt: skip
     """Write the site of `boards` (format tailgate-board-1) to the folder `out` and return the path of its first page.
 
-    replays: play each entry's worst episode again and write its page, or those of the defences that the user names, whose classes
-    may be imported for it. The pages of the others say that it was not done.
+    replays: play each entry's worst episode again and write its page, or those of the named defences. The user has named these, so that
+    their classes may be imported. The pages of the others say that it was not done.
     measured: the attachments of each board.
     Raises InputError before anything is written: for no board, two of a suite, a field that breaks the format, and
     attachments of another suite.
