@@ -61,7 +61,7 @@ def test_a_changed_or_foreign_trace_is_refused(tmp_path, monkeypatch):
 def test_arrays_of_objects_are_never_unpickled(tmp_path):
     path = tmp_path / "x.npz"
     np.savez(path, x=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(ValueError, match=r"[Oo]bject arrays"):
+    with pytest.raises(ValueError, match="object of shape"):
         traces.npz(path.read_bytes())
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("x.npy", b"\x93NUMPY")

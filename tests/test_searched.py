@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import json
 import lzma
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -102,10 +103,20 @@ def test_a_rank_asks_for_the_searches(made: tuple[Path, Path]) -> None:
     assert why([]) == "the standard ensemble (budget quick) has not attacked this defence"
     assert why([line | {"budget": "standard"}]) == "the ensemble attacked another budget: standard, not quick"
     assert why([line | {"digest": "abc"}]) == "the ensemble attacked another digest: abc, not none"
+    assert why([line | {"seed": 7}]) == "the ensemble attacked another seed: 7, not none"
+    empty = [cell | {"members": []} for cell in line["cells"]]
+    assert why([line | {"cells": empty}]) == "the search on radar-braking-v0 at dose 4 is not whole: no member scripts"
+    idle = [cell | {"members": [one | {"attack": None} for one in cell["members"]]} for cell in line["cells"]]
+    assert why([line | {"cells": idle}]).endswith("not whole: not one attack of a black box")
     assert why([line | {"cells": []}]) == "the ensemble has not attacked it on radar-braking-v0 at dose 4"
     assert why([line], [row for row in rows if row["attack"] != attack]) == f"what the ensemble found was not played on radar-braking-v0: {attack}"
     assert score([r for r in rows if r["defence"] != "chi2_kf"], suite, board=data)["searches"] == data["searches"]
+    stale = data | {"searches": [line | {"version": 99}]}
+    assert score(rows, suite, board=stale, searches=[line])["searches"] == [line]  # an entry that is made of rows takes their search
     read_board(data)
+    (folder / "attacked" / "chi2_kf.search.json").rename(folder / "chi2_kf.search.json")  # where a submission's --out may put it
+    assert searched.searches_in(folder) == [line]
+    (folder / "chi2_kf.search.json").rename(folder / "attacked" / "chi2_kf.search.json")
     (folder / "attacked" / "chi2_kf.search.json").write_text(json.dumps(line | {"cells": 3}))
     with pytest.raises(InputError, match=r"chi2_kf\.search\.json: cells.*list"):
         board_of(suite, folder)
@@ -196,3 +207,35 @@ def test_a_packed_board_is_read_and_kept_packed(made: tuple[Path, Path], capsys:
     assert capsys.readouterr().err.count("\n") == 1
     packed.write_bytes(lzma.compress(b" " * (80 << 20)))
     assert main(["leaderboard", "head", str(packed)]) == 2
+
+
+def test_a_round_has_a_search_of_its_own() -> None:
+    """Nobody knows the seed of a round before its beacon; an author cannot run the same search at home."""
+    one, two = (searched.seed_of(f"a beacon of sixteen letters, number {i}") for i in range(2))
+    assert searched.seed_of("") == 0 != one != two != 0
+
+
+def test_a_class_in_a_sandbox_is_searched_behind_the_veil(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It could be weak where it is searched and strong where it is scored, if it knew the keys of the episodes."""
+    from tailgate.sandbox import isolated
+
+    seen: list[bytes | None] = []
+    monkeypatch.setattr(standard, "search", lambda *_: seen.append(isolated._veil.get()))
+    monkeypatch.setattr(searched, "jobs_of", lambda *_: [])
+
+    def given(jobs: object, folder: Path, workers: int, progress: object, announce: object, one: Callable[..., object] | None) -> None:
+        (one or standard.search)(None, folder)
+        pytest.fail("seen enough")
+
+    monkeypatch.setattr(searched, "searched", given)
+    for text in ("bwrap/mydefence:Mine", "chi2_kf"):
+        with pytest.raises(pytest.fail.Exception, match="seen enough"):
+            searched.search(load_suite("radar-v1"), text, tmp_path, workers=1)
+    assert seen[0] and not seen[1]
+
+
+def test_two_boards_in_a_folder_are_refused(tmp_path: Path) -> None:
+    for name in ("board.json", "board.json.xz"):
+        save({}, tmp_path / name)
+    with pytest.raises(InputError, match="one board in the folder"):
+        board_in(tmp_path)

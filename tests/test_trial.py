@@ -38,8 +38,9 @@ def test_from_a_class_to_its_place_on_a_board(
     capsys.readouterr()
     assert main([*words, "--json"]) == 0
     entry = json.loads(capsys.readouterr().out)
-    assert entry["status"] == "ranked" and entry["why"] == "provisional: played by its author" and entry["rank"] is not None
-    made = json.loads(next(Path("tried").glob("*/suite-v1/board.json")).read_text())
+    assert entry["status"] == "ranked" and entry["why"] == "provisional: tried outside a round" and entry["rank"] is not None
+    made_in = next(Path("tried").glob("*/suite-v1"))
+    made = json.loads((made_in / "board.json").read_text())
     assert {e["defence"] for e in made["entries"]} == {"none", "kf", "stand_still", "tried_defence:Mine"}
     old = {e["defence"]: e for e in before["entries"]}
     assert all(e["rates"] == old[e["defence"]]["rates"] for e in made["entries"] if e["defence"] in old)
@@ -47,12 +48,14 @@ def test_from_a_class_to_its_place_on_a_board(
     page = Path(entry["page"]).read_text()
     table = page.partition("<tbody>")[2]
     assert table.index("tried_defence") < table.index("kf") and 'class="own"' in table and "provisional" in table
-    (replay,) = entry["replay"]
-    assert "<svg" in Path(replay).read_text() or "<canvas" in Path(replay).read_text()
+    assert "tried_defence" in Path(entry["replay"]).read_text()
     files = {path: path.read_bytes() for path in Path("tried").glob("*/**/*") if path.is_file()}
     assert main(words) == 0 and "provisional" in capsys.readouterr().out
     assert {path: path.read_bytes() for path in Path("tried").glob("*/**/*") if path.is_file()} == files  # nothing is played again
     Path("tried_defence.py").write_text(CLASS.replace("    pass", "    eta: float = 3.0"))
+    assert main(["leaderboard", "run", "suite-v1.yaml", "--out", str(made_in.parent), "--keep-entries", "--score-only"]) == 2
+    assert main([*words, "--json"]) == 0  # the changed class is another one
+    assert len(list(Path("tried").glob("*/suite-v1/board.json"))) == 2 and json.loads(capsys.readouterr().out)["defence"] == "tried_defence:Mine"
     assert json.loads(board.read_text()) == before  # the board that it joined stays as it is
 
 

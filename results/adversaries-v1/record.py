@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from tailgate.base import sizes
 from tailgate.base.errors import NotApplicable
 from tailgate.base.files import write_atomic
 from tailgate.base.locks import alone
@@ -47,7 +48,7 @@ def searched(job: Job, folder: Path) -> dict[str, Any]:
     begun = time.process_time()
     hunt = Hunt(job.arena, BUDGETS[job.budget], job.seed, folder / "attacks" / job.name, only=(*SCRIPTS, LEARNED))
     found = {one.member: one.found[0]._asdict() for one in harvest(hunt) if one.found}
-    script = max((found[name] for name in SCRIPTS if name in found), key=lambda one: one["score"])
+    script = max((found[name] for name in SCRIPTS if name in found), key=lambda one: one["score"], default=None)
     return {"script": script, "learned": found.get(LEARNED), "seconds": time.process_time() - begun}
 
 
@@ -71,12 +72,16 @@ def more(a: Array, b: Array) -> float:
 
 def compared(arena: Arena, runs: list[dict[str, Any]], episodes: int) -> dict[str, Any]:
     """Return a cell's line: the best script of all seeds, and each seed's network against it."""
-    script = max((run["script"] for run in runs), key=lambda one: one["score"])
+    scripts = [run["script"] for run in runs if run["script"]]
+    if not scripts or not all(run["learned"] for run in runs):
+        raise NotApplicable("defence", arena.defence, "one against which scripts and networks were found")
+    script = max(scripts, key=lambda one: one["score"])
     base, out = hits(arena, script["attack"], episodes), []
-    for run in runs:
-        held = run["learned"]
-        mine = hits(arena, held["attack"], episodes) if held else np.zeros(episodes, bool)
-        out.append({"share": float(mine.mean()), "score": held["score"] if held else 0.0, "p": more(mine, base), "less": more(base, mine)})
+    for held in (run["learned"] for run in runs):
+        mine = hits(arena, held["attack"], episodes)
+        share = proportion(int(mine.sum()), episodes)
+        figures = {"share": share.value, "low": share.low, "high": share.high, "score": held["score"]}
+        out.append(figures | {"p": more(mine, base), "less": more(base, mine)})
     share = proportion(int(base.sum()), episodes)
     return {
         "scenario": arena.name, "dose": arena.dose, "defence": arena.defence, "script": script["attack"],
@@ -102,19 +107,24 @@ def markdown(cells: list[dict[str, Any]], options: argparse.Namespace) -> str:
         "# Learned attacks against searched scripts", "",
         f"`python results/adversaries-v1/record.py --seeds {options.seeds} --episodes {options.episodes}`: budget quick of the standard",
         f"ensemble, black box, {options.episodes} fresh episodes a cell; 95 % intervals.",
-        "The script is the best script or program of all seeds.",
+        "The script is the best script or program of all seeds. A network begins at rest, as an imitation of one of these, or as a",
+        "published policy. Cells were chosen by hand, before this record, where an attack does damage at some times and none at others.",
         "", "| scenario, defence, dose | best script | learned, each seed | champion | seeds that win / lose | minutes of processor time |",
         "|---|---|---|---|---|---|",
     ]  # fmt: skip
     for cell in cells:
         said, best = [seed["verdict"] for seed in cell["seeds"]], cell["seeds"][cell["champion"]]
-        share, low, high = (100 * cell["scripts"][name] for name in ("share", "low", "high"))
         lines.append("| " + " | ".join([
-            f"`{cell['scenario']}`, `{cell['defence']}`, {cell['dose']}", f"{share:.1f} % ({low:.1f} to {high:.1f})",
-            ", ".join(f"{100 * seed['share']:.1f}" for seed in cell["seeds"]), f"{100 * best['share']:.1f}, {best['verdict']}",
+            f"`{cell['scenario']}`, `{cell['defence']}`, {cell['dose']}", _percent(cell["scripts"]),
+            ", ".join(f"{100 * seed['share']:.1f}" for seed in cell["seeds"]), f"{_percent(best)}, {best['verdict']}",
             f"{said.count('wins')} / {said.count('loses')} of {len(said)}", f"{cell['seconds'] / 60:.1f}",
         ]) + " |")  # fmt: skip
     return "\n".join(lines) + "\n"
+
+
+def _percent(held: dict[str, Any]) -> str:
+    share, low, high = (100 * held[name] for name in ("share", "low", "high"))
+    return f"{share:.1f} % ({low:.1f} to {high:.1f})"
 
 
 def main() -> None:
@@ -124,7 +134,10 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=2000, help="report episodes (default 2000)")
     parser.add_argument("--workers", type=int, default=2, help="processes (default 2); change no result")
     parser.add_argument("--out", type=Path, default=Path("runs/record"), help="finished searches; the same command goes on")
+    parser.add_argument("--report", type=Path, default=HERE, help="folder of report.json and report.md (default: next to this file)")
     options = parser.parse_args()
+    for name in ("seeds", "episodes", "workers"):
+        sizes.check(name, getattr(options, name))
     jobs: list[Job] = []
     for name, cells in read_yaml(HERE / "record.yaml", "record")["suites"].items():
         suite = load_suite(name)
@@ -147,9 +160,9 @@ def main() -> None:
             except NotApplicable as error:
                 print(f"{jobs[i].arena.defence}: {error}")
     verdicts(out)
-    write_atomic(HERE / "report.json", json.dumps(out, indent=1).encode() + b"\n")
+    write_atomic(options.report / "report.json", json.dumps(out, indent=1).encode() + b"\n")
     page = markdown(out, options)
-    write_atomic(HERE / "report.md", page.encode())
+    write_atomic(options.report / "report.md", page.encode())
     print(page)
 
 

@@ -45,16 +45,17 @@ def attack(
     changes = (*changes, f"workers={workers}")
     configs = configs_of(suite, defence, out / "policies", seeds=seeds, extra=changes) if plan.learners else []
     policies = train_against(configs, progress)
-    groups: dict[tuple[str, ...], list[str]] = {}  # a policy plays where the attacker sees and may do what it learned with
+    groups: dict[tuple[tuple[str, ...], str], list[str]] = {}  # a policy plays where the attacker sees and may do what it learned with
     for config in configs:
-        groups.setdefault(fitting(suite, config), []).extend(map(str, policies_of(config)))
+        groups.setdefault((fitting(suite, config), ""), []).extend(map(str, policies_of(config)))
     if plan.ensemble:
-        found = search(suite, defence, out, workers=workers, progress=progress)
+        found = search(suite, defence, out, beacon=beacon, workers=workers, progress=progress)
         for scenario, texts in attacks_of(found).items():
-            groups.setdefault((scenario,), []).extend(text for text in texts if text not in suite.attacks)
+            groups[(scenario,), "-found" if configs else ""] = [text for text in texts if text not in suite.attacks]
+        groups = {key: texts for key, texts in groups.items() if texts}
     files, count, counted = [], 0, counting(progress)
-    for scenarios, attacks in groups.items():
-        files.append(out / f"{stem(defence)}{f'-{scenarios[0]}' if len(groups) > 1 else ''}.jsonl")
+    for (scenarios, kind), attacks in groups.items():
+        files.append(out / f"{stem(defence)}{f'-{scenarios[0]}' if len(groups) > 1 else ''}{kind}.jsonl")
         part = dataclasses.replace(suite, scenarios=scenarios, attacks=tuple(attacks))
 
         def told(done: int, total: int) -> None:

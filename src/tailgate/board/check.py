@@ -27,6 +27,7 @@ from tailgate.evaluation.rows import CLEAN, Row
 from .cells import PRINTS, compared, figures, shared_of
 from .consistency import same, sharpened, strays, untold
 from .damage import reach_of
+from .entry import PROVISIONAL
 from .files import amended, known, read_board, suite_of
 from .schema import Board, CellLine, Data
 from .score import score
@@ -115,6 +116,7 @@ def _scored(data: Data, rows: list[Row], suite: Suite) -> Iterator[Data]:
         here = score(
             rows, suite, attacks=lines, alpha=said.get("alpha", 0.05), require_adaptive=adaptive, shared=shared_of(data),
             searches=data.get("searches", ()),
+            provisional=[entry["defence"] for entry in data["entries"] if str(entry.get("why")).startswith(PROVISIONAL)],
         )  # fmt: skip
     except InputError as error:
         yield {"defence": "", "field": "cells", "board": f"{len(data['cells'])} cells", "here": str(error)}

@@ -68,7 +68,7 @@ def entry_of(
     if not why and asked is not None and (missing := _unmet(table, defence, origins, asked, searches)):
         status, why = "unattacked", missing
     if not why and defence in provisional:
-        why = f"{PROVISIONAL}: played by its author"
+        why = f"{PROVISIONAL}: tried outside a round"
     whole = {k: worst for k, worst in levels.items() if worst.complete}
     return {
         "defence": defence, "card": None if card is None else card.card(), "uses": uses, "class": class_of(uses),

@@ -38,9 +38,11 @@ def read_json(path: Path, where: str, what: str = "JSON file", hint: str = "") -
 
 
 def board_in(folder: Path) -> Path:
-    """Return the file of the board in a suite's folder: the packed one where there is one."""
-    packed = folder / f"{BOARD}.xz"
-    return packed if packed.is_file() else folder / BOARD
+    """Return the file of the board in a suite's folder: the packed one where there is one. Raises InputError for both."""
+    plain, packed = folder / BOARD, folder / f"{BOARD}.xz"
+    if plain.is_file() and packed.is_file():
+        raise InputError("board", str(packed), f"one board in the folder: {plain.name} lies there too")
+    return packed if packed.is_file() else plain
 
 
 def save(board: Data, path: Path) -> None:

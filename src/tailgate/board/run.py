@@ -20,6 +20,7 @@ from tailgate.trust.run import REPORT, with_trust
 
 from .card import with_cards
 from .cells import shared_of
+from .entry import PROVISIONAL
 from .files import agree, board_in, load, read_board, read_json, save
 from .schema import Data
 from .score import score
@@ -101,7 +102,7 @@ def board_of(
     if not files:
         raise InputError("rows", str(folder), "a folder with rows of `leaderboard run`")
     path = board_in(folder)
-    before = kept_board(path, suite, beacon or "") if keep else load(path) if path.is_file() else None
+    before = kept_board(path, suite, beacon or "", provisional) if keep else load(path) if path.is_file() else None
     parts = {path: read_rows(path) for path in files}
     if keep and (other := {row["version"] for rows in parts.values() for row in rows} - {VERSION}):
         raise InputError("rows: version", min(other), f"{VERSION}, as the board's")
@@ -122,13 +123,18 @@ def board_of(
     return board
 
 
-def kept_board(path: Path, suite: Suite, beacon: str) -> Data:
-    """Return the JSON of a board whose entries stay. Raises InputError for none, and for another suite, version or round."""
+def kept_board(path: Path, suite: Suite, beacon: str, provisional: Collection[str] = ()) -> Data:
+    """Return the JSON of a board whose entries stay; none of these may be provisional but those that are tried again.
+
+    Raises InputError for no board, and for one of another suite, version or round.
+    """
     if not path.is_file():
         raise InputError("--keep-entries", str(path), "a board whose entries can stay")
     data: Data = load(path)
     board = read_board(data, str(path))
     agree(board, suite)
+    if tried := [entry.defence for entry in board.entries if entry.why.startswith(PROVISIONAL) and entry.defence not in provisional]:
+        raise InputError("--keep-entries", tried[0], "a board without entries that were only tried")
     if (board.suite.beacon or "") != beacon:
         raise InputError("beacon", beacon, f"that of the board, {board.suite.beacon or 'whose seeds are public ones'}")
     return data

@@ -69,12 +69,13 @@ def score(
     asked = asked_of(suite) if require_adaptive and suite.adaptive else [] if require_adaptive else None
     added: dict[str, frozenset[str]] = {} if held is None else held.added
     trained = {} if board is None else {a["attack"]: a["trained_on"] for a in board["attacks"] if a.get("trained_on")}
-    lines_of = {line["defence"]: line for line in (*searches, *(held.board.get("searches", ()) if held else ()))}
-    searches = [lines_of[d] for d in table.defences if d in lines_of]  # an entry that stays keeps its own
-    trained |= {attack: str(origin["defence"]) for attack, origin in origins.items()} | found_for(searches)
+    fresh, earlier = ({line["defence"]: line for line in lines} for lines in (searches, held.board.get("searches", ()) if held else ()))
+    merged = {d: (earlier if d in kept else fresh).get(d) for d in table.defences}  # an entry that stays keeps its own
+    searches = [line for line in merged.values() if line is not None]
+    trained = found_for(searches, table.listed) | trained | {attack: str(origin["defence"]) for attack, origin in origins.items()}
     found = [
         extended(kept[d], table, levels[d], dose, trained, added[d]) if d in added else dict(kept[d]) if d in kept
-        else entry_of(table, d, levels[d], dose, origins, trained, asked, searches, provisional) for d in table.defences
+        else entry_of(table, d, levels[d], dose, origins, trained | _found(merged[d]), asked, searches, provisional) for d in table.defences
     ]  # fmt: skip
     cells = ordered([*cells_of(table), *(held.cells if held else ())], table)
     return {
@@ -86,6 +87,11 @@ def score(
         ],
         "comparisons": rank(found, levels, dose, alpha, held), "detection": None,
     } | {name: held for name, held in (("searches", searches), ("trust", (board or {}).get("trust"))) if held}  # fmt: skip
+
+
+def _found(line: Data | None) -> dict[str, str]:
+    """Return the attacks that were found against one defence, with its name: others may have been found so too."""
+    return {} if line is None else found_for([line])
 
 
 def _suite(table: Table, alpha: float) -> Data:

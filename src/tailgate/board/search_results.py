@@ -32,4 +32,5 @@ class SearchedLine(Part):
     version: Count
     ensemble: Text
     budget: Text
+    seed: Count = 0
     cells: list[SearchedCell]

@@ -6,9 +6,9 @@ is played, in that scenario at all doses. The results lie with the rows, and the
 
 from __future__ import annotations
 
+import hashlib
 import json
-import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,11 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite
 from tailgate.core.spec_text import MARKS
 from tailgate.core.threat import KNOWLEDGE
-from tailgate.ensemble.standard import NAME, Progress, jobs_of, searched
+from tailgate.ensemble import standard
+from tailgate.ensemble.members import MEMBERS
+from tailgate.ensemble.standard import NAME, Job, Progress, jobs_of, searched
 from tailgate.evaluation.rows import Row
+from tailgate.sandbox.isolated import veiled
 from tailgate.training.adaptive import Adaptive, plan_of, stem
 
 from .damage import PLAYED, Table
@@ -35,12 +38,13 @@ FILES = ("policy:path=", "program:path=")  # attacks that lie in files
 
 
 def search(
-    suite: Suite, defence: str, out: Path, *, workers: int = 1, progress: Progress | None = None,
+    suite: Suite, defence: str, out: Path, *, beacon: str = "", workers: int = 1, progress: Progress | None = None,
     announce: Callable[[float], None] | None = None,
 ) -> Data:  # fmt: skip
     """Search attacks against a defence as a suite's plan says; a finished search is not run again.
 
-    Searches go to out/searches, the files of attacks that are played to out/found, and the results to out/DEFENCE.search.json.
+    beacon: the round, which decides the seed. A class in a sandbox does not see that it is searched. Searches go to out/searches, the
+    files of attacks that are played to out/found, and the results to out/DEFENCE.search.json.
 
     Returns
     -------
@@ -55,17 +59,28 @@ def search(
     plan = plan_of(suite)
     if set(str(out)) & set(MARKS):
         raise InputError("--out", str(out), f"a path without any of {MARKS}, as the texts of attacks hold it")
-    jobs = jobs_of(suite, defence, (), plan.searched(suite), plan.ensemble, 0)
+    jobs = jobs_of(suite, defence, (), plan.searched(suite), plan.ensemble, seed_of(beacon))
     spec = Spec("defence", defence)
     folder = writable_directory(out / "searches" / stem(defence))
     with alone(folder):
-        results = searched(jobs, folder, workers, progress, announce)
+        results = searched(jobs, folder, workers, progress, announce, _veiled if spec.sandboxed else None)
     line: Data = {
         "defence": spec.target, "digest": spec.digest, "version": spec.entry.version, "ensemble": NAME, "budget": plan.ensemble,
-        "cells": [_cell(result, out / "found") for result in results],
+        "seed": seed_of(beacon), "cells": [_cell(result, out / "found") for result in results],
     }  # fmt: skip
     write_atomic(out / f"{stem(defence)}{ENDING}", json.dumps(line, indent=1).encode() + b"\n")
     return line
+
+
+def seed_of(beacon: str) -> int:
+    """Return the seed of the searches of a round: nobody knows it before the beacon. It is 0 on public seeds."""
+    return int.from_bytes(hashlib.blake2b(beacon.encode(), digest_size=4).digest(), "big") if beacon else 0
+
+
+def _veiled(job: Job, folder: Path, tell: Callable[[int, int, str, float], None] | None = None) -> Data:
+    """Run one search; a class in a sandbox cannot tell its episodes from those that count."""
+    with veiled():
+        return standard.search(job, folder, tell)
 
 
 def _cell(result: Data, folder: Path) -> Data:
@@ -96,9 +111,9 @@ def _placed(text: str, folder: Path) -> str:
         return text
     source = Path(text.removeprefix(head))
     writable_directory(folder)
-    for file in (source, source.with_suffix(".safetensors")):
-        if file.is_file():
-            shutil.copyfile(file, folder / file.name)
+    weights = source.with_suffix(".safetensors")
+    for file in (source, *([weights] if weights.is_file() else [])):
+        write_atomic(folder / file.name, file.read_bytes())
     return f"{head}{folder / source.name}"
 
 
@@ -114,7 +129,9 @@ def attacks_of(line: Data) -> dict[str, list[str]]:
 def searches_in(folder: Path) -> list[Data]:
     """Return the results of all searches in a suite's folder, by defence. Raises InputError for a damaged file."""
     out: dict[str, Data] = {}
-    for path in sorted(folder.glob(f"attacked/**/*{ENDING}")):
+    for path in sorted(folder.glob(f"**/*{ENDING}")):
+        if any(part.startswith(".") or part in ("searches", "policies", "trust") for part in path.relative_to(folder).parts[:-1]):
+            continue
         data = read_json(path, "search")
         try:
             line = SearchedLine.model_validate(data)
@@ -127,11 +144,11 @@ def searches_in(folder: Path) -> list[Data]:
     return [out[name] for name in sorted(out)]
 
 
-def found_for(searches: Iterable[Data]) -> dict[str, str]:
-    """Return the defence that each attack was found against; of an attack that was found twice the first."""
+def found_for(searches: Iterable[Data], listed: Collection[str] = ()) -> dict[str, str]:
+    """Return the defence that each attack was found against, of an attack that was found twice the first; without those on a list."""
     out: dict[str, str] = {}
     for line in searches:
-        for attack in (attack for mine in attacks_of(line).values() for attack in mine):
+        for attack in (attack for mine in attacks_of(line).values() for attack in mine if attack not in listed):
             out.setdefault(attack, line["defence"])
     return out
 
@@ -145,6 +162,8 @@ def unsearched(table: Table, row: Row, searches: Sequence[Data], plan: Adaptive)
     if line is None:
         return f"the standard ensemble (budget {plan.ensemble}) has not attacked this defence"
     own = {"digest": row["defence_digest"], "version": row.get("versions", {}).get("defence", 1), "ensemble": NAME, "budget": plan.ensemble}
+    own |= {"seed": seed_of(table.beacon)}
+    line = dict[str, Any](seed=0, **line) if "seed" not in line else line  # older ones have none
     for name, value in own.items():
         if line[name] != value:
             return f"the ensemble attacked another {name}: {line[name] or 'none'}, not {value or 'none'}"
@@ -155,12 +174,29 @@ def unsearched(table: Table, row: Row, searches: Sequence[Data], plan: Adaptive)
             cell = cells.get((name, dose))
             if cell is None:
                 return f"the ensemble has not attacked it on {name} at dose {dose}"
+            if lacks := _lacking(cell):
+                return f"the search on {name} at dose {dose} is not whole: {lacks}"
             played = {
                 one.attack for one, state in zip(table.attackers, table.state[name][index], strict=True) if (state == PLAYED).all()
             }  # fmt: skip
             found = {one["attack"] for one in cell["members"]} - {None} - table.withdrawn
             if left := sorted(found - played):
                 return f"what the ensemble found was not played on {name}: {left[0]}"
+    return ""
+
+
+def _lacking(cell: Data) -> str:
+    """Return what a whole search has and a cell has not: every member with damage or a reason, and one attack of each knowledge."""
+    members = {one["member"]: one for one in cell["members"]}
+    if left := [one.name for one in MEMBERS if one.name not in members]:
+        return f"no member {left[0]}"
+    for name, one in members.items():
+        if one["damage"] is None and not one["why"]:
+            return f"neither damage nor a reason of {name}"
+    for level in KNOWLEDGE:
+        mine = [one for one in members.values() if one["knowledge"] == level and one["damage"] is not None]
+        if mine and sum(one["attack"] is not None for one in mine) != 1:
+            return f"not one attack of a {level} box"
     return ""
 
 

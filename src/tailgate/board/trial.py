@@ -12,6 +12,7 @@ from tailgate.base.files import writable_directory
 from tailgate.base.progress import cells
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite
+from tailgate.core.schema import digest
 
 from .attacked import Progress, attack
 from .files import agree, board_in, load, read_board, save
@@ -51,7 +52,8 @@ def try_out(
     suite, defence
         A suite, and a defence on a command line, such as module:Class.
     out
-        Folder of what is made; rows, attackers and board of a suite lie in out/DIGEST/SUITE, with the digest of the class's files.
+        Folder of what is made; rows, attackers and board lie in out/DIGEST/SUITE. Another class, another version of it, other parameters or
+        another board have another digest.
     board
         The board that it joins; by default the published one of the package. Without any it is alone with the undefended car.
 
@@ -68,7 +70,8 @@ def try_out(
     held = published(suite) if board is None else load(board)
     if held is not None:
         agree(read_board(held), suite)
-    folder = writable_directory(out / (spec.digest[:8] or "built-in") / suite.name)  # rows of a class that was changed lie elsewhere
+    joined = None if held is None else digest(held)
+    folder = writable_directory(out / digest([spec.digest, defence, joined])[:8] / suite.name)  # of this class as it is, and this board
     path, keep = board_in(folder), held is not None
     if held is not None and not path.is_file():
         save(held, path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +34,12 @@ def add(commands: Commands) -> None:
 def _trace(text: str) -> tuple[str, float]:
     name, _, seconds = text.partition(":")
     try:
-        return name, float(seconds or 0.0)
+        begin = float(seconds or 0.0)
     except ValueError:
-        raise InputError("--trace", text, "NAME or NAME:SECONDS") from None
+        begin = math.nan
+    if not 0.0 <= begin < math.inf:
+        raise InputError("--trace", text, "NAME or NAME:SECONDS, with seconds not below 0")
+    return name, begin
 
 
 def _fit(options: argparse.Namespace) -> int:

@@ -32,6 +32,7 @@ def add(actions: Commands) -> None:
 
 def _try(options: argparse.Namespace) -> int:
     from tailgate.base.locks import alone
+    from tailgate.base.reading import load_json
     from tailgate.board.attachments import Attachments
     from tailgate.board.trial import try_out
     from tailgate.cli.board import print_board
@@ -47,10 +48,12 @@ def _try(options: argparse.Namespace) -> int:
             suite, options.defence, out, workers=options.workers, progress=update, say=tell,
             board=Path(options.board) if options.board else None,
         )  # fmt: skip
-        page = build_site([made.board], out / "page", replays=[options.defence], measured=[Attachments.of(made.file)])
-    entry, replay = made.entry, sorted(page.parent.glob("*/*-replay.html"))
+        folder = made.file.parent.parent / "page"
+        page = build_site([made.board], folder, replays=[options.defence], measured=[Attachments.of(made.file)])
+    entry, summary = made.entry, load_json(page.parent / "summary.json")
+    replay = next(line["replay"] for line in summary["entries"] if line["defence"] == options.defence)
     if options.json:
-        print_json({key: entry[key] for key in FIELDS} | {"page": str(page), "replay": [str(path) for path in replay]})
+        print_json({key: entry[key] for key in FIELDS} | {"page": str(page), "replay": str(page.parent / replay) if replay else None})
     else:
         print_board(made.board)
         if entry["rank"]:
@@ -59,5 +62,6 @@ def _try(options: argparse.Namespace) -> int:
             say(f"{options.defence}: rank {place} of {of} in class {entry['class']}, provisional")
         else:
             say(f"{options.defence}: no rank; {entry['why']}")
-    print(f"page: {page}; replay: {replay[0] if replay else 'none'} ({(time.perf_counter() - begun) / 60:.1f} min)", file=sys.stderr)
+    took = f"{(time.perf_counter() - begun) / 60:.1f} min"
+    print(f"page: {page}; replay: {page.parent / replay if replay else 'none'} ({took})", file=sys.stderr)
     return 0

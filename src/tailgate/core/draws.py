@@ -84,7 +84,12 @@ def keys(purpose: str, seeds: Sequence[int]) -> Keys:
         for i, seed in enumerate(seeds):
             digest = hashlib.blake2b(f"{purpose}/{party}/{int(seed)}".encode(), digest_size=8).digest()
             out[p, i] = int.from_bytes(digest, "little")
-    return Keys(out.T, np.full(len(seeds), PURPOSES.index(purpose) << _SHIFT, np.uint32))
+    return Keys(out.T, first_episodes(purpose, len(seeds)))
+
+
+def first_episodes(purpose: str, batch: int) -> Array:
+    """Return the counters (B,) uint32 of first episodes of a purpose."""
+    return np.full(batch, PURPOSES.index(purpose) << _SHIFT, np.uint32)
 
 
 @cache

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tailgate.agents.policy.zoo import zoo_names
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array
 from tailgate.core.registry import Spec, entries
@@ -99,7 +100,10 @@ def _policies(hunt: Hunt, knowledge: str) -> list[str]:
 
 def _transfer(hunt: Hunt) -> list[str]:
     """Play the published policies that have a meaning here."""
-    return [f"zoo:name={policy.name}" for policy, _ in transferred(hunt.arena)]
+    found = transferred(hunt.arena)
+    if not found:
+        raise NotApplicable("zoo", f"{len(zoo_names())} policies", "one with the observations and the actions of this threat model")
+    return [f"zoo:name={policy.name}" for policy, _ in found]
 
 
 def _white_box(hunt: Hunt) -> list[str]:

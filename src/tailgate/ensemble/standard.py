@@ -112,7 +112,8 @@ def search(job: Job, folder: Path, tell: Callable[[int, int, str, float], None] 
 
 
 def searched(
-    jobs: Sequence[Job], folder: Path, workers: int = 1, progress: Progress | None = None, announce: Callable[[float], None] | None = None
+    jobs: Sequence[Job], folder: Path, workers: int = 1, progress: Progress | None = None,
+    announce: Callable[[float], None] | None = None, one: Callable[..., dict[str, Any]] | None = None,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Run searches, and return their results in order (`search`). Those that the folder has are not run again.
 
@@ -122,13 +123,15 @@ def searched(
         Its `searches` has the results, its `attacks` the files of programs and policies.
     announce
         Called with the seconds that the searches will take, about, before they begin.
+    one
+        Runs one search, in a process where there are several; by default `search`.
 
     Raises
     ------
     InputError
         For a damaged result.
     """
-    update = progress or (lambda *_: None)
+    update, one = progress or (lambda *_: None), one or search
     done = {i: held for i, job in enumerate(jobs) if (held := _kept(job, folder)) is not None}
     left = [i for i in range(len(jobs)) if i not in done]
     if announce is not None and left:
@@ -142,12 +145,12 @@ def searched(
         update("searches", len(done), len(jobs), f"{result['scenario']}: {best['damage']:.0%} by {best['attack']}" if best else "")
 
     if workers > 1 and len(left) > 1:
-        for number, result in each(search, [(jobs[i], folder) for i in left], workers):
+        for number, result in each(one, [(jobs[i], folder) for i in left], workers):
             finish(left[number], result)
     else:
         for i in left:
             label = f"{jobs[i].arena.scenario}, dose {jobs[i].arena.dose}"
-            finish(i, search(jobs[i], folder, lambda n, of, text, mean, label=label: update(label, n, of, text)))  # type: ignore[misc]
+            finish(i, one(jobs[i], folder, lambda n, of, text, mean, label=label: update(label, n, of, text)))  # type: ignore[misc]
     return [done[i] for i in range(len(jobs))]
 
 
@@ -261,9 +264,10 @@ def _compared(result: dict[str, Any], rows: list[dict[str, Any]], suite: Suite) 
     reach = {row["seed"]: row["distance_travelled"] for row in mine if row["attack"] == CLEAN}
 
     def hit(row: dict[str, Any]) -> bool:
-        stalled = suite.progress is not None and row["distance_travelled"] is not None and (
-            row["distance_travelled"] < suite.progress * reach[row["seed"]]
-        )
+        way, share = row["distance_travelled"], suite.progress
+        if share is not None and way is not None and row["seed"] not in reach:
+            raise InputError(f"clean run of seed {row['seed']}", None, f"one that was played: {suite.name} counts lost progress")
+        stalled = share is not None and way is not None and way < share * reach[row["seed"]]
         return bool(row["crashed"]) or stalled or (suite.bound is not None and row["max_error"] > suite.bound)
 
     def damage(text: str | None) -> dict[str, Any] | None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from tailgate.core import Array, Attack
-from tailgate.core.draws import Keys, Role
+from tailgate.core.draws import Keys, Role, first_episodes
 from tailgate.core.loop import Loop, LoopState
 from tailgate.engine.agreement import Untraced
 from tailgate.falsify.claim import Invariant
@@ -48,7 +48,7 @@ def played(loop: Loop, attack: Attack, keys: Array, plain: bool = False) -> Trac
 
 
 def _keys(key: Array) -> Keys:
-    return Keys(key, np.zeros(len(key), np.uint32))
+    return Keys(key, first_episodes("report", len(key)))
 
 
 def _with_keys(state: LoopState, keys: Keys) -> LoopState:

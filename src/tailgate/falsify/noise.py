@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tailgate.core import Array, Attack
-from tailgate.core.draws import Draws, Keys, Role
+from tailgate.core.draws import Draws, Keys, Role, first_episodes
 from tailgate.core.loop import START, Loop
 from tailgate.falsify.claim import Invariant
 from tailgate.falsify.road import Given, Overheard, Slot
@@ -87,7 +87,7 @@ class NoisyLoop:
         margins, noises = [], []
         for first in range(0, len(keys), self.at_once):
             part = slice(first, first + self.at_once)
-            held = Keys(keys[part], np.zeros(len(keys[part]), np.uint32))
+            held = Keys(keys[part], first_episodes("report", len(keys[part])))
             shifted = Shifted.of(held, self.slots, mean[part], size)
             trace = rollout(self.loop, self.attack, shifted, plain=True)
             margins.append(self.invariant.margins(trace, self.loop.horizon).min(axis=0))

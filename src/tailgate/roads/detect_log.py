@@ -86,7 +86,7 @@ def smoothed(held: Cut) -> Array:
 
 def threat_of(settings: Settings, dt: float, horizon: int) -> ThreatModel:
     """Return the threat model of a replay: every kind of a wire, within the bounds of road-v0."""
-    onset = max(1, round(min(ONSET / dt, horizon / 4)))
+    onset = max(1, round(max(min(ONSET, horizon * dt / 4.0), SETTLING) / dt))  # what comes before is not counted
     held = {
         "kinds": KINDS, "fdi_bound": BOUND, "jam_range": (0.0, 200.0), "budget": max(1, round(settings.dose / dt)), "onset": onset,
         "memory": max(1, round(5.0 / dt)),
