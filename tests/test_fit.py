@@ -87,6 +87,8 @@ def test_the_defaults_of_the_controller_are_the_fit_to_all_cars(tmp_path, capsys
 @pytest.mark.parametrize("arguments, words", [
     (["--trace", "us06"], "fit.traces: got 'us06'; expected a recording of a string"),
     (["--trace", "asta-braking"], "fit.traces: got 'asta-braking'; expected a recording that begins at rest"),
+    (["--trace", "asta-string:nan"], "--trace: got 'asta-string:nan'; expected NAME or NAME:SECONDS, with seconds not below 0"),
+    (["--trace", "asta-string:-30"], "--trace: got 'asta-string:-30'; expected NAME or NAME:SECONDS"),
     (["--trace", "asta-string:x"], "--trace: got 'asta-string:x'; expected NAME or NAME:SECONDS"),
     (["--window", "1"], "fit.window: got 1.0; expected 5 to 1000 s"),
     (["--window", "700"], "fit.window: got 700.0; expected at most half of the recording"),

@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import io
 import zipfile
 from pathlib import Path
 
@@ -56,6 +57,18 @@ def test_a_changed_or_foreign_trace_is_refused(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="trace us06: got 'SHA-256"):
         traces.trace("us06")
     traces._columns.cache_clear()
+
+
+def test_headers_that_lie_about_their_size_or_break_off_are_refused():
+    """Nothing is allocated that is not there; no error but ValueError leaves the reader."""
+    whole = io.BytesIO()
+    np.save(whole, np.arange(6.0))
+    good = whole.getvalue()
+    assert traces.npy(good).tolist() == list(range(6))
+    huge = good.replace(b"(6,)", b"(10000000000000,)").replace(b" " * 12, b"", 1)
+    for bad in (huge, good[:40], good[:100], good[:-8], good + b"1", good.replace(b"<f8", b"|O8"), good.replace(b"(6,)", b"((((")):
+        with pytest.raises(ValueError):
+            traces.npy(bad)
 
 
 def test_arrays_of_objects_are_never_unpickled(tmp_path):
