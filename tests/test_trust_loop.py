@@ -18,7 +18,7 @@ from tailgate.base.errors import InputError
 from tailgate.board.files import read_board
 from tailgate.board.run import board_of
 from tailgate.board.words import at_least
-from tailgate.cli.board import _print_board
+from tailgate.cli.board import print_board
 from tailgate.core import draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_scenario, load_suite
@@ -342,14 +342,14 @@ def test_a_board_takes_up_the_report_that_lies_beside_its_rows(found: Found, sho
     suite = _suite(short)
     evaluate(suite, out=tmp_path / "rows.jsonl")
     bare = board_of(suite, tmp_path)
-    _print_board(bare)
+    print_board(bare)
     words = " ".join(capsys.readouterr().out.split())
     assert "trust" not in words and "public seeds: for development" in words and "trust" not in bare
     shutil.copytree(found[1], tmp_path / "trust")
     board = board_of(suite, tmp_path)
     assert board == with_trust(bare, found[0]) == json.loads((tmp_path / "board.json").read_text()) and read_board(board).trust is not None
     board["suite"]["beacon"] = "[b]1"
-    _print_board(board)
+    print_board(board)
     words = " ".join(capsys.readouterr().out.split())
     assert "trust" in words and "seeds of the beacon [b]1" in words and at_least(found[0]["defences"][0]["safety"]["black"]["lower"], 1) in words
     for text in ("{", "[]", '{"a": NaN}', json.dumps(found[0] | {"version": "0"})):
