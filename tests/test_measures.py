@@ -297,7 +297,7 @@ def test_trust_reports_informedness_next_to_detection() -> None:
 def test_a_suite_v1_is_that_of_v0_with_the_measures(name: str) -> None:
     old, new = load_suite(f"{name}-v0"), load_suite(f"{name}-v1")
     assert new.measures and new.progress == (None if name == "network" else 0.5) and old.progress is None and not old.measures
-    assert new == replace(old, name=new.name, progress=new.progress, measures=True, adaptive={"ensemble": "quick"}) and new.hash != old.hash
+    assert new == replace(old, name=new.name, about=new.about, progress=new.progress, measures=True, adaptive={"ensemble": "quick"}) and new.hash != old.hash
 
 
 def test_a_suite_that_cannot_count_progress_is_refused(tmp_path: Path) -> None:
