@@ -25,17 +25,13 @@ from tailgate.base.files import write_atomic
 from tailgate.base.locks import alone
 from tailgate.base.pool import each
 from tailgate.base.progress import progress
-from tailgate.core import Array, draws
-from tailgate.core.registry import Spec
+from tailgate.core import Array
 from tailgate.core.scenario import load_suite
 from tailgate.core.schema import read_yaml
-from tailgate.ensemble.battery import Played
 from tailgate.ensemble.members import BUDGETS, Hunt, harvest
 from tailgate.ensemble.search import Arena
 from tailgate.ensemble.standard import Job
 from tailgate.evaluation.stats import holm, proportion
-from tailgate.play.metrics import METRICS
-from tailgate.play.trace import rollout
 
 HERE = Path(__file__).parent
 FIRST = 20261128  # of the report episodes: no search and no suite has met them
@@ -54,12 +50,7 @@ def searched(job: Job, folder: Path) -> dict[str, Any]:
 
 def hits(arena: Arena, text: str, episodes: int) -> Array:
     """Return which report episodes (episodes,) an attack damages."""
-    spec = Spec("attack", text)
-    attack = spec.make()
-    loop = arena.seat(spec.entry.knowledge, attack)
-    trace = rollout(loop, attack, draws.keys("report", range(FIRST, FIRST + episodes)))
-    played = Played(METRICS["crashed"](trace) > 0, *(METRICS[name](trace) for name in ("min_gap", "max_error", "distance_travelled")))
-    return arena.harm(played, arena.reach("report", FIRST, episodes))[0]
+    return arena.harm(*arena.outcome(text, "report", FIRST, episodes))[0]
 
 
 def more(a: Array, b: Array) -> float:

@@ -11,7 +11,8 @@ from tailgate.engine.operations import BOOL, FLOAT
 from tailgate.engine.passes import rounds, schedule
 
 if TYPE_CHECKING:
-    from tailgate.engine.llvm import Column, Emitter
+    from tailgate.engine.layout import Column
+    from tailgate.engine.llvm import Emitter
 
 ROWS = 10  # rows of a matrix that are summed at once
 

@@ -24,7 +24,7 @@ from tailgate.engine import cuda_parts, sweeps
 from tailgate.engine.cuda_parts import HEAD, LANES, TYPES, Type, constant, element, load, operation, saved, shared
 from tailgate.engine.graph import Node
 from tailgate.engine.instructions import code
-from tailgate.engine.llvm import Column, Held, Layout
+from tailgate.engine.layout import Column, Held, Layout, Writer, last_read
 from tailgate.engine.passes import Branch, Item, counted, schedule
 
 THREADS = 128  # of a block of the grid
@@ -33,7 +33,7 @@ INLINED = 4000  # most nodes of routines that are repeated at each use
 KERNELS = ("play_step", "play_steps")
 
 
-class Emitter:
+class Emitter(Writer):
     """The text of one function."""
 
     def __init__(self, layout: Layout) -> None:
@@ -153,19 +153,6 @@ class Emitter:
 
     # -- order
 
-    def emit(self, items: Sequence[Item], stores: dict[int, list[Held | Column]]) -> None:
-        """Emit the items, and store each result as soon as nothing reads its place afterwards."""
-        for item in items:
-            if isinstance(item, Branch):
-                self.branch(item)
-                done = item.decides
-            else:
-                self.compute(item)
-                done = [item]
-            for node in done:
-                for place in stores.pop(node.id, ()):
-                    self.store(node, place)
-
     def branch(self, branch: Branch) -> None:
         mask = self.value(branch.mask)
         decided = {choice.id for choice in branch.decides}
@@ -276,10 +263,7 @@ def _step(e: Emitter, items: Sequence[Item]) -> None:
     here = {item.id: turn for turn, item in enumerate(items) if not isinstance(item, Branch)}
     here |= {node.id: turn for turn, item in enumerate(items) if isinstance(item, Branch) for node in item.decides}
     late = {place.offset for i, place in layout.inputs.items() if isinstance(place, Held) and i not in here}  # read in a branch, or never
-    read: dict[int, int] = {}
-    for turn, item in enumerate(items):
-        if not isinstance(item, Branch) and item.op == "input" and isinstance(place := layout.inputs.get(item.id), Held):
-            read[place.offset] = turn
+    read = last_read(items, layout)
     waiting: dict[int, list[Held | Column]] = {}
     rest: list[tuple[Node, Held | Column]] = []
     for node, to in layout.outputs:

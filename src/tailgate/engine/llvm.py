@@ -16,7 +16,6 @@ from __future__ import annotations
 import contextlib
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -24,42 +23,13 @@ import numpy as np
 from tailgate.engine import blocks, sweeps
 from tailgate.engine.graph import Node
 from tailgate.engine.instructions import operation, scalar
+from tailgate.engine.layout import Column, Held, Layout, Writer, last_read
 from tailgate.engine.operations import BOOL, FLOAT
 from tailgate.engine.passes import Branch, Item, counted, schedule
 from tailgate.engine.routines import bound
 
 
-@dataclass(frozen=True)
-class Held:
-    """The place of a number of the state: its offset in a block [bytes]."""
-
-    offset: int
-
-
-@dataclass(frozen=True)
-class Column:
-    """The place of a number in an array (episodes, columns), or (steps, episodes, columns), of the table."""
-
-    array: int
-    column: int
-    columns: int
-
-
-@dataclass
-class Layout:
-    """The places from which the function reads its numbers and to which it writes them."""
-
-    inputs: dict[int, Held | Column]  # by node
-    outputs: list[tuple[Node, Held | Column]]
-    stride: int  # bytes of a block's state
-    given: int = 0  # number of argument arrays; the arrays after them are results, on the sheet
-    demands: list[Node] = field(default_factory=list)  # conditions that must hold
-    uniforms: dict[int, int] = field(default_factory=dict)  # node -> its slot
-    slots: list[Node] = field(default_factory=list)  # contents of the table of shared numbers
-    tables: dict[tuple[int, ...], int] = field(default_factory=dict)  # consecutive nodes -> the slot of the first
-
-
-class Emitter:
+class Emitter(Writer):
     """The text of one function."""
 
     def __init__(self, layout: Layout, lanes: int) -> None:
@@ -234,19 +204,6 @@ class Emitter:
 
     # -- order
 
-    def emit(self, items: Sequence[Item], stores: dict[int, list[Held | Column]]) -> None:
-        """Emit the items, and store each result as soon as nothing reads its place afterwards."""
-        for item in items:
-            if isinstance(item, Branch):
-                self.branch(item)
-                done = item.decides
-            else:
-                self.compute(item)
-                done = [item]
-            for node in done:
-                for place in stores.pop(node.id, ()):
-                    self.store(node, place)
-
     def branch(self, branch: Branch) -> None:
         mask = self.value(branch.mask)
         if branch.side == 2:
@@ -349,7 +306,7 @@ def _step(e: Emitter, least: int) -> tuple[list[Item], int]:
     rest: list[tuple[Node, Held | Column]] = []
     rows: dict[int, list[tuple[Column, Node]]] = {}
     large: list[tuple[Node, Held | Column]] = []
-    read = _last_read(items, layout)
+    read = last_read(items, layout)
     for node, place in layout.outputs:
         if node.size:
             large.append((node, place))
@@ -371,12 +328,3 @@ def _step(e: Emitter, least: int) -> tuple[list[Item], int]:
         assert isinstance(place, Held)
         sweeps.copy(e, e.value(node), e.address("%state", place.offset), node, node.size)
     return items, room
-
-
-def _last_read(items: Sequence[Item], layout: Layout) -> dict[int, int]:
-    """Return the last item that reads each number of the state, by offset."""
-    out = {}
-    for i, item in enumerate(items):
-        if not isinstance(item, Branch) and item.op == "input" and isinstance(place := layout.inputs.get(item.id), Held):
-            out[place.offset] = i
-    return out

@@ -18,7 +18,7 @@ from tailgate.engine import objects
 from tailgate.engine.cards import Card, DeviceError, Memory, OutOfMemory, card
 from tailgate.engine.cuda import KERNELS, THREADS, only, text_of
 from tailgate.engine.cuda_parts import LANES
-from tailgate.engine.llvm import Layout
+from tailgate.engine.layout import Layout
 from tailgate.engine.operations import Array
 from tailgate.engine.passes import LEAST
 from tailgate.engine.program import Call, Program, State, Trace

@@ -27,7 +27,8 @@ from tailgate.engine.buffers import WIDE, buffer_of, copied
 from tailgate.engine.functions import makers
 from tailgate.engine.graph import Graph, Node
 from tailgate.engine.hints import broken
-from tailgate.engine.llvm import Column, Held, Layout, text_of
+from tailgate.engine.layout import Column, Held, Layout
+from tailgate.engine.llvm import text_of
 from tailgate.engine.operations import Array, DTypeLike
 from tailgate.engine.parameters import Reading
 from tailgate.engine.passes import LEAST

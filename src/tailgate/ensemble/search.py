@@ -204,16 +204,20 @@ class Arena:
             near = np.maximum(np.exp(-np.maximum(played.gap, 0.0) / CLOSE), self._stalled(played, reach)[1])
         return np.asarray(damage + SHAPED * near)
 
-    def confirmed(self, text: str, purpose: str, first: int, episodes: int) -> tuple[float, float]:
-        """Return the share of damaged episodes and the mean score of an attack, as `evaluate` plays it."""
+    def outcome(self, text: str, purpose: str, first: int, episodes: int) -> tuple[Played, Array | None]:
+        """Return the outcome of an attack (episodes,), as `evaluate` plays it, and the distances that it is judged by (`reach`)."""
         spec = Spec("attack", text)
         attack = spec.make()
         loop = self.seat(spec.entry.knowledge, attack)
         trace = rollout(loop, attack, draws.keys(purpose, range(first, first + episodes)))
         gap = METRICS["min_gap"](trace) if loop.model.followers.any() else np.full(episodes, np.inf)
         played = Played(METRICS["crashed"](trace) > 0, gap, *(METRICS[name](trace) for name in ("max_error", "distance_travelled")))
-        reach = self.reach(purpose, first, episodes)
-        return float(np.mean(self.harm(played, reach)[0])), float(np.mean(self.score(played, reach)))
+        return played, self.reach(purpose, first, episodes)
+
+    def confirmed(self, text: str, purpose: str, first: int, episodes: int) -> tuple[float, float]:
+        """Return the share of damaged episodes and the mean score of an attack, as `evaluate` plays it."""
+        outcome = self.outcome(text, purpose, first, episodes)
+        return float(np.mean(self.harm(*outcome)[0])), float(np.mean(self.score(*outcome)))
 
     def best(self, texts: Iterable[str]) -> list[Found]:
         """Return attacks after the last stage, on select episodes that they all meet, the most harmful first."""
