@@ -217,10 +217,11 @@ def draw_order(held: dict[str, Any]) -> bytes:
         x, y = ([100.0 * scored[part][name] for name in names] for part in ("synthetic", other))
         ax.scatter(x, y, color="C0", s=22)
         for i, name in enumerate(names):
-            ax.annotate(name, (x[i], y[i]), fontsize=7, xytext=(3, 3), textcoords="offset points")
+            left = any(0.0 < x[j] - x[i] < 9.0 and abs(y[j] - y[i]) < 4.0 for j in range(len(names)))  # a neighbour's room
+            ax.annotate(name, (x[i], y[i]), (-4 if left else 4, 3), fontsize=7, textcoords="offset points", ha="right" if left else "left")
         low, high = found["spearman_interval"]
         ax.set_title(f"{title}: rank correlation {found['spearman']:+.2f} [{low:+.2f}, {high:+.2f}]", fontsize=9)
-        ax.set(xlabel="undamaged on the synthetic 3 s road [%]", ylabel=f"undamaged, {title} [%]", xlim=(-5, 115), ylim=(-5, 105))
+        ax.set(xlabel="undamaged on the synthetic 3 s road [%]", ylabel=f"undamaged, {title} [%]", xlim=(30, 125), ylim=(-5, 105))
         ax.grid(alpha=0.3)
     return png(figure)
 
