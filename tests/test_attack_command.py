@@ -92,6 +92,7 @@ def test_another_defence_of_the_same_name_is_searched_again(tmp_path, monkeypatc
     assert names[0] != names[1]
 
 
+@pytest.mark.long
 def test_a_class_of_ones_own_is_attacked(small_ensemble, tmp_path, monkeypatch, capsys):
     """The file of a policy does not name it, so that nobody who reads the file imports it."""
     (tmp_path / "attacked_defence.py").write_text("from tailgate.estimators import GatedKalman\n\n\nclass Mine(GatedKalman):\n    pass\n")
@@ -105,6 +106,7 @@ def test_a_class_of_ones_own_is_attacked(small_ensemble, tmp_path, monkeypatch, 
     assert "attacked_defence" not in Path(networks["attack"].partition("=")[2]).read_text()
 
 
+@pytest.mark.long
 def test_a_scenario_of_ones_own(small_ensemble, tmp_path, monkeypatch):
     """Its rows carry its name; another content under the same path is searched again; files lie in the folder that was named."""
     source = (Path(__file__).parents[1] / "configs" / "scenarios" / "radar-braking-v0.yaml").read_text()
@@ -120,6 +122,7 @@ def test_a_scenario_of_ones_own(small_ensemble, tmp_path, monkeypatch):
     assert standard.jobs_of(suite, "chi2_kf", (), (), "quick", 0)[0].name != names[0]
 
 
+@pytest.mark.long
 def test_budgets_share_no_file(small_ensemble, tmp_path, monkeypatch):
     """Two budgets in one folder keep their own policies."""
     monkeypatch.setitem(members.BUDGETS, "standard", members.BUDGETS["quick"])

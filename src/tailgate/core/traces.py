@@ -61,7 +61,7 @@ def _columns(name: str) -> dict[str, Array]:
 
 
 def npy(content: bytes) -> Array:
-    """Return the array of an npy file; nothing is unpickled. Raise ValueError for anything but plain numbers."""
+    """Return the array of an npy file; nothing is unpickled. Raise ValueError for objects and for a damaged file."""
     file = io.BytesIO(content)
     try:
         version = np.lib.format.read_magic(file)
@@ -70,7 +70,7 @@ def npy(content: bytes) -> Array:
     except Exception as error:  # its parser of headers raises many kinds
         raise ValueError(f"a damaged header ({type(error).__name__})") from None
     held = content[file.tell() :]
-    if dtype.kind not in "iuf" or fortran or len(shape) > 3 or math.prod(shape) * dtype.itemsize != len(held):
+    if dtype.hasobject or fortran or len(shape) > 3 or math.prod(shape) * dtype.itemsize != len(held):
         raise ValueError(f"{dtype} of shape {shape} in {len(held)} bytes")
     return np.frombuffer(held, dtype).reshape(shape)
 
