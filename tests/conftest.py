@@ -219,6 +219,11 @@ def asked(browser):
 @pytest.fixture
 def small_ensemble(monkeypatch):
     """The standard attack ensemble at a size that a test can pay for."""
+    shrink_ensemble(monkeypatch)
+
+
+def shrink_ensemble(monkeypatch):
+    """Make the standard attack ensemble small until the patch is undone."""
     from tailgate.ensemble import members, networks, standard
     from tailgate.ensemble import search as searching
 

@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import json
 import lzma
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,6 +28,8 @@ from tailgate.evaluation.cells import Cell, run
 from tailgate.evaluation.rows import read_rows
 from tailgate.training.adaptive import SIZES, plan_of
 
+from .conftest import shrink_ensemble
+
 TEXT = """about: s
 progress: 0.5
 measures: true
@@ -47,14 +50,24 @@ def _run(*arguments: str) -> None:
     assert options.run(options) == 0
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a suite's file and its board, made once."""
+    folder = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        shrink_ensemble(patch)
+        patch.chdir(folder)
+        Path("small-v1.yaml").write_text(TEXT)
+        _run("small-v1.yaml", "--out", "out", "--train")
+    return folder
+
+
 @pytest.fixture
-def made(small_ensemble: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
-    """A suite's file, and the folder of its board, relative to the working directory."""
+def made(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+    """A copy of the suite's file, and the folder of its board, relative to the working directory."""
+    shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
-    file = Path("small-v1.yaml")
-    file.write_text(TEXT)
-    _run(str(file), "--out", "out", "--train")
-    return file, Path("out/small-v1")
+    return Path("small-v1.yaml"), Path("out/small-v1")
 
 
 def test_one_command_searches_before_it_ranks(made: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
