@@ -34,7 +34,7 @@ def test_the_command(small_ensemble, tmp_path, capsys, monkeypatch):
     assert main([*WORDS, "--out", str(tmp_path), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     (cell,) = report["cells"]
-    assert report["ensemble"] == "standard-v0" and cell["listed"]["attack"] in load_suite("radar-v0").attacks
+    assert report["ensemble"] == "standard-v1" and cell["listed"]["attack"] in load_suite("radar-v0").attacks
     assert cell["found"]["episodes"] == 20 and cell["found"]["low"] <= cell["found"]["damage"] <= cell["found"]["high"]
     assert json.loads((tmp_path / "attack.json").read_text()) == report
     attacks = (tmp_path / "attacks.txt").read_text().splitlines()

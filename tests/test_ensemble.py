@@ -1,10 +1,12 @@
 """The standard attack ensemble: many scripts in one program, the search, and the command."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from tailgate.agents.learners.cem import scales
 from tailgate.base.errors import InputError
 from tailgate.core import draws
 from tailgate.core.draws import Keys
@@ -15,7 +17,7 @@ from tailgate.engine.agreement import Untraced
 from tailgate.ensemble import networks
 from tailgate.ensemble import search as searching
 from tailgate.ensemble.battery import Played, Scripts, battery_of, played_plainly, remembered
-from tailgate.ensemble.networks import Evolution, Race, learned, starts_of
+from tailgate.ensemble.networks import Evolution, Race, _without_copies, learned, ramp_of, starts_of
 from tailgate.ensemble.search import Arena, Effort, search
 from tailgate.ensemble.space import FAMILIES, GENES, NEVER
 from tailgate.play.metrics import METRICS
@@ -176,15 +178,48 @@ def test_a_policy_is_played_as_its_file_says(tmp_path, monkeypatch):
 
 
 def test_starts(monkeypatch):
-    """Rest, what a script does, at its size and on its wires, and published policies against the defence before others."""
+    """Rest and what a script does in every form, at its size and on its wires; published policies against the defence before others."""
     monkeypatch.setattr(networks, "SHOWN", 8)
     place, script = (
         arena("car", threat={"kinds": ("dos_jam", "fdi"), "fdi_bound": 4.0}),
         "fdi:trigger=near,threshold=40,value=-2,targets=[velocity]",
     )
     starts = starts_of(place, "black", [script], 0)
-    assert [start.name for start in starts[:2]] == ["rest", f"as {script}"] and "-chi2_kf-" in starts[2].name
+    forms = ["hidden layer of 16, 1 frame", "linear, 4 frames", "linear, 1 frame, a ramp"]
+    names = [f"{name} ({form})" for form in forms for name in ("rest", f"as {script}")]
+    assert [start.name for start in starts[:6]] == names and "-chi2_kf-" in starts[6].name
     assert {"fdi-*0.5:velocity", "fdi+", "dos_jam:position"} <= {mode.name for mode in starts[1].plan.action.modes}
+    assert [start.name for start in starts_of(place, "black", [script], 0, names[3:5])[:2]] == names[3:5]
+
+
+def test_a_ramp_is_learned_in_its_steps():
+    """A ramp says the first value and the rate; a script of one size begins at half of it; a hold has no value that could grow."""
+    place = arena("car", threat={"kinds": ("dos_hold", "fdi"), "fdi_bound": 4.0})
+    ramp, flat = (ramp_of(place, f"{name},trigger=near,threshold=40") for name in ("fdi_ramp:base=-2.4,rate=0.5", "fdi:value=-9"))
+    assert (ramp.action, ramp.value, ramp.rate) == ("ramp", -2.4, 0.5) and (flat.value, flat.rate) == (-4.0, 0.9)
+    assert ramp_of(place, "dos_hold:trigger=near,threshold=40") is None
+
+
+def test_of_copies_of_a_script_the_best_one_runs():
+    """Forms differ in how well they imitate: the worse copy of a script does not take part; all that rest do."""
+    runs = [SimpleNamespace(start=SimpleNamespace(script=script), champion=(score, None)) for script, score in
+            (("", 0.1), ("a", 0.5), ("", 0.1), ("a", 0.7), ("b", 0.2))]  # fmt: skip
+    assert _without_copies(runs) == [runs[0], runs[2], runs[3], runs[4]]
+
+
+def test_a_still_observation_keeps_its_size():
+    """Small observations are scaled up before a network learns from them; one that does not change is left as it is."""
+    seen = np.array([[0.0, 1.0, 5.0], [0.02, -1.0, 5.0]], np.float32)
+    np.testing.assert_allclose(scales(seen), [0.01, 1.0, 1.0], rtol=1e-6)
+
+
+def test_the_clean_distance_is_the_metric(monkeypatch):
+    """The distances that an attacked run is judged by are those of the clean run, to the bit, in both engines."""
+    place = dataclasses.replace(arena("car"), progress=0.5)
+    wanted = METRICS["distance_travelled"](rollout(place.loop, Spec("attack", "none").make(), draws.keys("tune", range(3, 11))))
+    np.testing.assert_array_equal(place.reach("tune", 3, 8), wanted)
+    monkeypatch.setattr(searching, "battery_of", lambda *_: Untraced("asked for"))
+    np.testing.assert_array_equal(dataclasses.replace(place).reach("tune", 3, 8), wanted)
 
 
 def test_policies_are_learned(tmp_path, monkeypatch):
@@ -193,11 +228,12 @@ def test_policies_are_learned(tmp_path, monkeypatch):
     place = Arena(suite.name, "radar-braking-v0", 9, "kf", dict(suite.threat), suite.bound)
     monkeypatch.setattr(networks, "JUDGED", 128)
     race = Race(16, (networks.Phase(8, 16), networks.Phase(4, 32)))
-    texts = learned(place, "black", [], race, 0, tmp_path)
+    texts, starts = learned(place, "black", [], race, 0, tmp_path)
+    assert all(name.startswith("rest") for name in starts[:1])
     damage = place.confirmed(texts[0], "select", 0, 128)[0]
     assert damage > place.confirmed("none", "select", 0, 128)[0] + 0.3
     held = [(tmp_path / "policies" / name).read_bytes() for name in sorted(path.name for path in (tmp_path / "policies").iterdir())]
-    assert learned(place, "black", [], race, 0, tmp_path) == texts
+    assert learned(place, "black", [], race, 0, tmp_path).attacks == texts
     assert held == [path.read_bytes() for path in sorted((tmp_path / "policies").iterdir())]
     assert race.episodes(3, 1) == 3 * 128 + 3 * (8 * 16 * 16 + 128) + 2 * (4 * 32 * 16 + 128)
 

@@ -122,6 +122,17 @@ def test_the_zoo_plays_as_the_file_does() -> None:
     assert attack.learned and attack.sources == [zoo_path(FIRST)]
 
 
+def test_a_policy_keeps_its_kinds_where_more_are_granted() -> None:
+    """A threat model that grants more kinds of attack changes nothing of what a policy does."""
+    own = {"kinds": ["dos_jam", "fdi"], "budget": 20, "fdi_bound": 3.0}
+    rows = [
+        evaluate(scenarios=["gusty-stop-and-go-v0"], defences=["chi2_kf"], attacks=[f"zoo:name={FIRST}"], seeds=4, threat=own | {"kinds": kinds})
+        for kinds in (own["kinds"], ["dos_hold", "fdi", "dropout", "dos_jam"])
+    ]  # fmt: skip
+    assert all(row["status"] == "ok" and row["attack_steps"] > 0 for row in rows[0])
+    assert [row["trace_hash"] for row in rows[0]] == [row["trace_hash"] for row in rows[1]]
+
+
 def test_where_a_policy_does_not_fit_its_rows_are_skipped() -> None:
     """Another scenario has another observation: a pairing without meaning, with the reason."""
     rows = evaluate(scenarios=["thesis-ch5-v0"], defences=["norm_resilient"], attacks=[f"zoo:name={FIRST}"], doses=[None], seeds=2)

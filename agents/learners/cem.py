@@ -43,6 +43,7 @@ from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.envs.gym.batches import framed, side_by_side
 
 IMITATION_ROUNDS, IMITATION_BATCH, IMITATION_RATE = 400, 4096, 0.03
+STILL = 1e-6  # standard deviation below which an observation does not change
 FORMAT = "tailgate-cem-checkpoint-2"
 Share = Annotated[float, Field(gt=0, le=1)]
 
@@ -288,8 +289,10 @@ def imitation(shape: Shape, shown: Demonstration, rng: np.random.Generator, batc
     """Return weights (length,) that decide as shown (behaviour cloning: softmax regression through all layers, by Adam).
 
     Only the largest output counts, so that the scale of the last layer is free. Its root mean square is set to 1: the spread of a first
-    generation is then the size of a change relative to it.
+    generation is then the size of a change relative to it. Each observation is divided by its standard deviation while it learns, so that
+    one of small numbers counts as much as the others.
     """
+    size = scales(shown.observation)
     theta = rng.standard_normal(shape.length)
     for weight, bias in shape.layers(theta):  # views
         weight /= np.sqrt(len(weight))
@@ -297,14 +300,21 @@ def imitation(shape: Shape, shown: Demonstration, rng: np.random.Generator, batc
     first, second = np.zeros_like(theta), np.zeros_like(theta)
     for t in range(1, IMITATION_ROUNDS + 1):
         some = rng.integers(0, len(shown.action), batch)
-        slope = _slope(shape, theta, shown.observation[some].astype(np.float64), shown.action[some])
+        slope = _slope(shape, theta, shown.observation[some] / size, shown.action[some])
         first, second = 0.9 * first + 0.1 * slope, 0.999 * second + 0.001 * slope**2
         theta -= IMITATION_RATE * (first / (1.0 - 0.9**t)) / (np.sqrt(second / (1.0 - 0.999**t)) + 1e-8)
     weight, bias = shape.layers(theta)[-1]
     scale = np.sqrt(np.mean(np.concatenate([weight.ravel(), bias]) ** 2))
     weight /= scale
     bias /= scale
+    shape.layers(theta)[0][0][:] /= size[:, None]
     return theta
+
+
+def scales(observation: Array) -> Array:
+    """Return the standard deviation (d,) of each observation (D, d); 1 for one that does not change."""
+    size = np.std(observation.astype(np.float64), axis=0)
+    return np.where(size > STILL, size, 1.0)
 
 
 def _slope(shape: Shape, theta: Array, seen: Array, action: Array) -> Array:

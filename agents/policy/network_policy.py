@@ -166,7 +166,7 @@ class PolicyAttack:
 
     def prepare(self, brief: Brief) -> PolicyPlan:
         header, network = self._loaded
-        agents = brief.model.agents
+        brief, agents = _learned_under(header, brief), brief.model.agents
         if (1 if header.agents is None else header.agents) != agents:
             made = f"a policy for {_count(header.agents or 1)}"
             raise InputError(f"policy {self.path.name}", made, f"one for this scenario's {_count(agents)}")
@@ -213,6 +213,17 @@ class PolicyAttack:
         chosen = choose(plan.network, plan.action, read, chance, always, plan.action.mask(view) if plan.masked else None)
         action = np.where(due if chosen.ndim == 1 else due[:, None], chosen, state.action)
         return PolicyState(action, np.where(due[:, None], seen, state.seen), memory)
+
+
+def _learned_under(header: Header, brief: Brief) -> Brief:
+    """Return the brief with the kinds of attack that a policy learned with, where these are a part of the granted ones."""
+    record, granted = header.training.get("threat_model"), brief.threat.kinds
+    held = record.get("kinds") if isinstance(record, dict) else None
+    kinds = held if isinstance(held, list) else []
+    own = [kind for kind in granted if kind in kinds]
+    if not own or len(own) != len(kinds) or len(own) == len(granted):
+        return brief
+    return dataclasses.replace(brief, threat=dataclasses.replace(brief.threat, kinds=tuple(kinds)))
 
 
 def _trained_with(header: Header) -> str:

@@ -16,13 +16,14 @@ from tailgate.core.registry import Spec, entries
 from tailgate.core.schema import fields_of
 from tailgate.engine.untraceable import Untraceable
 from tailgate.ensemble.gradient import Pace, gradient
-from tailgate.ensemble.networks import PUBLISHED, Phase, Race, learned, transferred
+from tailgate.ensemble.networks import FORMS, PUBLISHED, Phase, Race, is_ramp, learned, transferred
 from tailgate.ensemble.search import FINALISTS, Arena, Effort, Found, Tell, search
 
 ALIKE = 2  # finalists of a family: others may come from behind
 IMITATED = 2  # scripts that networks imitate at the start
 OPENED = (0.1, 0.25, 0.5, 0.75)  # of the range of gaps: where white boxes begin
-STARTS = 1 + IMITATED + PUBLISHED  # of a race of policies, at most
+STARTS = len(FORMS) * (2 + IMITATED) + 4 + PUBLISHED  # of a race of policies, at most: four move a value step by step
+GREY = 3  # starts of the race of those that know the control too: the best of the race of the others
 
 
 @dataclass(frozen=True)
@@ -42,11 +43,12 @@ class Budget:
 
     def episodes(self, agents: int) -> int:
         """Return the episodes that all members play in a scenario, about."""
-        return self.scripts.episodes(agents) + self.programs.episodes(agents) + 2 * self.race.episodes(STARTS, agents)
+        races = self.race.episodes(STARTS, agents) + self.race.episodes(GREY + PUBLISHED, agents)
+        return self.scripts.episodes(agents) + self.programs.episodes(agents) + races
 
 
 BUDGETS = {
-    "quick": Budget(Effort(512, 5), Effort(256, 4), 32, ((20, 32), (20, 64)), Pace(256, 1, 8, 64)),
+    "quick": Budget(Effort(512, 5), Effort(256, 4), 32, ((16, 16), (12, 32), (24, 64)), Pace(256, 1, 8, 64)),
     "standard": Budget(Effort(2048, 12), Effort(1024, 10), 64, ((40, 32), (40, 64), (60, 128)), Pace(2048, 2, 20, 128)),
 }
 
@@ -62,15 +64,16 @@ class Hunt:
     tell: Tell | None = None
     only: tuple[str, ...] = ()  # members that search; empty: all
     genomes: Array | None = None  # of the best scripts
+    starts: list[str] = field(default_factory=list)  # of the black-box networks, the best first
     found: dict[str, list[Found]] = field(default_factory=dict)  # by member
 
     @property
     def best_scripts(self) -> list[str]:
-        """The best scripts so far, each of another family."""
+        """The best scripts so far, each of another family; and the best ramp."""
         out: dict[str, str] = {}
         for one in self.found.get("scripts", []):
             out.setdefault(one.attack.partition(":")[0], one.attack)
-        return list(out.values())[:IMITATED]
+        return list(dict.fromkeys([*list(out.values())[:IMITATED], *filter(is_ramp, out.values())]))[: IMITATED + 1]
 
 
 def _scripts(hunt: Hunt) -> list[str]:
@@ -95,7 +98,10 @@ def _programs(hunt: Hunt) -> list[str]:
 
 
 def _policies(hunt: Hunt, knowledge: str) -> list[str]:
-    return learned(hunt.arena, knowledge, hunt.best_scripts, hunt.budget.race, hunt.seed, hunt.folder, hunt.tell)
+    """Learn networks; those that know more than the road begin as the best of the others did."""
+    found = learned(hunt.arena, knowledge, hunt.best_scripts, hunt.budget.race, hunt.seed, hunt.folder, hunt.tell, hunt.starts[:GREY])
+    hunt.starts = hunt.starts or found.starts
+    return found.attacks
 
 
 def _transfer(hunt: Hunt) -> list[str]:
@@ -103,7 +109,7 @@ def _transfer(hunt: Hunt) -> list[str]:
     found = transferred(hunt.arena)
     if not found:
         raise NotApplicable("zoo", f"{len(zoo_names())} policies", "one with the observations and the actions of this threat model")
-    return [f"zoo:name={policy.name}" for policy, _ in found]
+    return hunt.arena.promising(f"zoo:name={policy.name}" for policy, _ in found)
 
 
 def _white_box(hunt: Hunt) -> list[str]:
@@ -120,7 +126,7 @@ def _white_box(hunt: Hunt) -> list[str]:
             except (NotApplicable, InputError):
                 continue
             out.append(text)
-    return out
+    return hunt.arena.promising(out)
 
 
 def _gradient(hunt: Hunt) -> list[str]:

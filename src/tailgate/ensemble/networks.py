@@ -7,24 +7,26 @@ The method is CMA-ES with a diagonal covariance (Ros and Hansen 2008). One compi
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from cmaes import SepCMA
 
-from tailgate.agents.learners.cem import Shape, imitation, lean
+from tailgate.agents.learners.cem import Shape, imitation, lean, scales
 from tailgate.agents.learners.learning import header_of
-from tailgate.agents.learners.teacher import demonstrate
+from tailgate.agents.learners.teacher import Demonstration, demonstrate
 from tailgate.agents.policy.network_policy import PolicyAttack, PolicyPlan, save_policy
 from tailgate.agents.policy.zoo import ZooAttack, zoo_names
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, draws
 from tailgate.core.draws import Keys, Role
+from tailgate.core.loop import Loop
 from tailgate.core.neural import Network
 from tailgate.core.registry import Spec
 from tailgate.core.schema import as_data, digest
@@ -38,6 +40,8 @@ from tailgate.envs.gym.observations import ObservationCodec
 from tailgate.envs.gym.rewards import Reward
 
 HIDDEN, REST = 16, 0.5  # width of the hidden layer; how much a network leans towards rest at first
+SEEN = 4  # steps that a linear policy sees, so that it can time bursts and pauses
+FIRST_RATE = 0.2  # of the first value of a ramp that is made from a script of one size: its rate
 SHOWN = 128  # episodes of the script that a network imitates, for a system of one agent
 SPREAD = 0.3  # of the first generation: of the size of a network's weights, and by itself where they are 0
 RAMP = (1, 3, 9)  # steps of a ramp whose sizes a policy may send
@@ -45,7 +49,8 @@ COPIED = 1024  # decisions of a script in a step of its imitation
 JUDGED = 1024  # episodes that decide which starts go on, for a system of one agent
 LEAST, FEWEST = 16, 8  # policies of a generation, and episodes that each plays, at least
 FIRST = 1 << 30  # number of the first episode that starts are judged on: no search meets it before
-PUBLISHED = 2  # policies of the zoo that join, at most
+PUBLISHED, ZOO = 2, "zoo "  # policies of the zoo that join, at most; how their names begin
+SLOWEST = 1e-3  # of the bound: the slowest ramp
 
 
 class Phase(NamedTuple):
@@ -76,11 +81,27 @@ class Race:
         return total
 
 
+class Form(NamedTuple):
+    """The form of a network: the steps that it sees, and the width of its hidden layer; 0: none."""
+
+    frames: int
+    hidden: int
+
+    def __str__(self) -> str:
+        return f"{f'hidden layer of {self.hidden}' if self.hidden else 'linear'}, {self.frames} frame{'s' * (self.frames > 1)}"
+
+
+FORMS = (Form(1, HIDDEN), Form(SEEN, 0))  # of policies that choose among sizes
+RAMPING = Form(1, 0)  # of policies that move a value
+
+
 class Start(NamedTuple):
     """A first network, and the actions that its outputs choose among."""
 
     name: str
     plan: PolicyPlan
+    size: Array  # (d,) standard deviation of each observation: the less one varies, the larger are the changes of its weights
+    script: str = ""  # that it imitates
 
 
 class Evolution:
@@ -93,8 +114,12 @@ class Evolution:
         parts = [part for pair in zip(network.weights, network.biases, strict=True) for part in pair]
         self.shape = Shape(tuple(itertools.pairwise((len(network.weights[0]), *map(len, network.biases)))))
         self.mean = self.first = np.concatenate([part.ravel() for part in parts])
-        sizes = [np.sqrt(np.mean(part**2)) if start.name != "rest" else 1.0 for part in parts]
-        self.unit = np.concatenate([np.full(part.size, SPREAD * (size or 1.0)) for part, size in zip(parts, sizes, strict=True)])
+        reads = [np.ones_like(part) for part in parts]
+        reads[0] /= start.size[:, None]
+        sizes = [np.sqrt(np.mean((part / read) ** 2)) or 1.0 for part, read in zip(parts, reads, strict=True)]
+        if start.name.startswith("rest"):
+            sizes = [1.0] * len(parts)
+        self.unit = SPREAD * np.concatenate([(size * read).ravel() for size, read in zip(sizes, reads, strict=True)])
         self.method = SepCMA(np.zeros(self.first.size), 1.0, population_size=population, seed=seed)
         self.battery = self._battery(population)
         held = Parameters((self.loop, self.attack, start.plan))
@@ -156,7 +181,7 @@ class Evolution:
         weights, biases = zip(*self.shape.layers(self.champion[1]), strict=True)
         training: dict[str, Any] = {
             "summary": "learned by the standard attack ensemble", "start": self.start.name, "seed": seed, "episodes": self.episode,
-            "config": {"scenario": arena.scenario, "threat": dict(arena.threat)},
+            "config": {"scenario": arena.scenario, "threat": dict(arena.threat)}, "threat_model": as_data(self.loop.threat),
         }  # fmt: skip
         if not Spec("defence", arena.defence).imports:  # a file shall not name somebody's class
             training["config"]["defence"] = arena.defence
@@ -191,41 +216,99 @@ def action_of(arena: Arena, scripts: Sequence[str]) -> ActionSpec:
     )  # fmt: skip
 
 
-def starts_of(arena: Arena, knowledge: str, scripts: Sequence[str], seed: int) -> list[Start]:
-    """Return the starts of a race: rest, an imitation of each script, and published policies that fit.
+def is_ramp(script: str) -> bool:
+    """If the value of a script grows from step to step."""
+    made = Spec("attack", script).make()
+    return hasattr(made, "base") and hasattr(made, "rate")
 
-    Raises NotApplicable where the threat model grants nothing that a policy could choose.
+
+def ramp_of(arena: Arena, script: str) -> ActionSpec | None:
+    """Return the actions of a policy that raises, keeps or lowers a value step by step; None for a script without a value.
+
+    A ramp says the first value and the rate. The ramp of another script begins at half of its value.
     """
-    loop = arena.seat(knowledge)
-    try:
-        codec, seen = ActionCodec(action_of(arena, scripts), loop.brief), ObservationCodec(loop.brief)
-    except InputError as error:
-        raise NotApplicable(error.field, error.value, error.expected) from None
+    made, threat = Spec("attack", script).make(), arena.loop.brief.threat
+    aired = script.startswith("echo")
+    bound, sent = (threat.delay_bound, "delay") if aired else (threat.fdi_bound, "value")
+    base = made.base if is_ramp(script) else 0.5 * getattr(made, sent, 0.0)
+    if not bound or not base or not (aired or script.startswith("fdi")):
+        return None
+    rate = abs(made.rate) if is_ramp(script) else FIRST_RATE * abs(base)
+    base, rate = np.clip([base, rate], (-bound, SLOWEST * bound), bound).tolist()
+    fixed = replace(action_of(arena, [script]), action="ramp", shares=(), rate=rate)
+    if aired:
+        return replace(fixed, delay=max(abs(base), SLOWEST * bound))
+    return replace(fixed, value=float(np.clip(base, *threat.jam_range)))
+
+
+def _drawn(
+    loop: Loop, action: ActionSpec, forms: Sequence[Form], scripts: Sequence[str], seed: int, only: Sequence[str]
+) -> list[Start]:  # fmt: skip
+    """Return, in each form, a policy with these actions that rests, and one that imitates each script. only: names that are made."""
+    codec, deep = ActionCodec(action, loop.brief), ObservationCodec(loop.brief, SEEN)
     if codec.size < 2:
         raise NotApplicable("threat_model.kinds", loop.threat.kinds, "a kind of attack to choose")
-    shape = Shape(tuple(itertools.pairwise((len(seen.names), HIDDEN, codec.size))))
+    seat, episodes = Seat(loop, codec, deep, Reward(), {}), max(SHOWN // loop.model.agents, FEWEST)
 
-    def plan(theta: Array) -> PolicyPlan:
+    @functools.cache
+    def shown(script: str) -> Demonstration:
+        return demonstrate(seat, Spec("attack", script).make(), seed, episodes)
+
+    out = []
+    for form, script in itertools.product(forms, ("", *scripts)):
+        name = f"{f'as {script}' if script else 'rest'} ({form}{', a ramp' if action.action == 'ramp' else ''})"
+        if only and name not in only:
+            continue
+        seen = ObservationCodec(loop.brief, form.frames)
+        width = len(seen.names)  # the newest frame comes first
+        shape = Shape(tuple(itertools.pairwise((width, *([form.hidden] if form.hidden else []), codec.size))))
+        if script:
+            one = shown(script)._replace(observation=shown(script).observation[:, :width])
+            size, theta = scales(one.observation), imitation(shape, one, np.random.default_rng([seed, len(one.action)]), COPIED)
+        else:
+            size = scales(np.concatenate([shown(one).observation[:, :width] for one in scripts or ("none",)]))
+            theta = np.zeros(shape.length)
+            theta[shape.length - codec.size] = lean(REST, codec.size)
         weights, biases = zip(*((weight.copy(), bias.copy()) for weight, bias in shape.layers(theta)), strict=True)
-        return PolicyPlan(Network(weights, biases), codec, seen)
+        out.append(Start(name, PolicyPlan(Network(weights, biases), codec, seen), size, script))
+    return out
 
-    rest = np.zeros(shape.length)
-    rest[shape.length - codec.size] = lean(REST, codec.size)
-    out, seat = [Start("rest", plan(rest))], Seat(loop, codec, seen, Reward(), {})
-    for script in scripts:
-        shown = demonstrate(seat, Spec("attack", script).make(), seed, max(SHOWN // loop.model.agents, FEWEST))
-        out.append(Start(f"as {script}", plan(imitation(shape, shown, np.random.default_rng([seed, len(shown.action)]), COPIED))))
+
+def starts_of(arena: Arena, knowledge: str, scripts: Sequence[str], seed: int, only: Sequence[str] = ()) -> list[Start]:
+    """Return the starts of a race: rest and an imitation of each script in every form, and published policies that fit.
+
+    Policies that move a value step by step begin from the first script of one size, and from the first ramp.
+    only: names of those that are made, next to the published ones; empty: all.
+    Raises NotApplicable where the threat model grants nothing that a policy could choose.
+    """
+    loop, out = arena.seat(knowledge), []
+    try:
+        out += _drawn(loop, action_of(arena, scripts), FORMS, scripts, seed, only)
+        moved = [(script, action) for script in scripts if (action := ramp_of(arena, script)) is not None]
+        for ramp in (False, True):
+            for script, action in [one for one in moved if is_ramp(one[0]) == ramp][:1]:
+                out += _drawn(loop, action, [RAMPING], [script], seed, only)
+    except InputError as error:
+        raise NotApplicable(error.field, error.value, error.expected) from None
     fit = [
-        Start(f"zoo {policy.name}", held) for policy, held in transferred(arena)
+        Start(ZOO + policy.name, held, np.ones(len(held.observation.names))) for policy, held in transferred(arena)
         if policy.knowledge == knowledge and held.network.lstm is None and held.action.discrete
     ]  # fmt: skip
     return [*out, *fit[:PUBLISHED]]
 
 
+class Learned(NamedTuple):
+    """The result of a race: attacks as on the command line, and the names of the starts, the best first."""
+
+    attacks: list[str]
+    starts: list[str]
+
+
 def learned(
-    arena: Arena, knowledge: str, scripts: Sequence[str], race: Race, seed: int, folder: Path, tell: Tell | None = None
-) -> list[str]:  # fmt: skip
-    """Learn policies against an arena's defence; return the two that did most harm as attacks on the command line.
+    arena: Arena, knowledge: str, scripts: Sequence[str], race: Race, seed: int, folder: Path, tell: Tell | None = None,
+    only: Sequence[str] = (),
+) -> Learned:  # fmt: skip
+    """Learn policies against an arena's defence; return the two that did most harm.
 
     Parameters
     ----------
@@ -235,6 +318,8 @@ def learned(
         Attacks that networks imitate at the start.
     folder
         The policies' files are written below it.
+    only
+        Names of the starts that take part, and published policies; empty: all.
 
     Raises
     ------
@@ -242,7 +327,8 @@ def learned(
         Where the defence is not traced, as a policy would be learned too slowly, and where there is nothing to choose.
     """
     members = race.members(arena.loop.model.agents)
-    runs = [Evolution(arena, knowledge, start, members, seed) for start in starts_of(arena, knowledge, scripts, seed)]
+    starts = starts_of(arena, knowledge, scripts, seed, only)
+    runs = _without_copies([Evolution(arena, knowledge, start, members, seed) for start in starts])
     left, total, done = list(runs), sum(phase.generations for phase in race.phases), 0
     for phase in race.phases:
         episodes = max(phase.episodes // arena.loop.model.agents, FEWEST)
@@ -255,7 +341,14 @@ def learned(
         for run in left:
             run.compare()
         left = sorted(left, key=lambda run: -run.champion[0])[: math.ceil(len(left) / 2)]
-    return [run.write(folder, seed) for run in sorted(runs, key=lambda run: -run.champion[0])[:2]]
+    order = sorted(runs, key=lambda run: -run.champion[0])
+    return Learned([run.write(folder, seed) for run in order[:2]], [run.start.name for run in order])
+
+
+def _without_copies(runs: list[Evolution]) -> list[Evolution]:
+    """Return the runs, of those that imitate one script only that which does most harm: the forms differ in how well they imitate."""
+    best = {run.start.script: run for run in sorted(runs, key=lambda run: run.champion[0])}
+    return [run for run in runs if not run.start.script or best[run.start.script] is run]
 
 
 def transferred(arena: Arena) -> list[tuple[ZooAttack, PolicyPlan]]:

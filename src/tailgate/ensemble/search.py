@@ -6,6 +6,7 @@ time, so that luck is not believed. The same seed finds the same scripts, whatev
 
 from __future__ import annotations
 
+import contextlib
 import time
 import zlib
 from collections.abc import Callable, Iterable
@@ -15,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tailgate.base.errors import InputError
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Attack, draws
 from tailgate.core.draws import Keys
 from tailgate.core.loop import Loop
@@ -37,6 +38,7 @@ EACH = 8  # scripts of a family that are kept, at most: others may come from beh
 FRESH = 0.25  # share of a generation that is drawn at random
 CHANGED, STEP = 0.3, 0.08  # probability that a gene is changed, and by how much (standard deviation)
 FINALISTS, FINAL = 8, 512  # scripts of the last stage, and its episodes
+TRIED, LISTED = 128, 4  # select episodes of every attack that is not searched; those that are played on as many as the finalists
 AT_ONCE = 4096  # episodes of one agent side by side
 
 
@@ -130,8 +132,10 @@ class Arena:
         at = purpose, first, episodes
         if at not in self._reached:
             none: Attack = Spec("attack", "none").make()
-            trace = rollout(self.loop, none, draws.keys(purpose, range(first, first + episodes)))
-            self._reached[at] = METRICS["distance_travelled"](trace)
+            plan, keys = none.prepare(self.loop.brief), draws.keys(purpose, range(first, first + episodes))
+            battery = battery_of(self.loop, none, plan, None)
+            clean = played_plainly(self.loop, none, plan, keys, None) if isinstance(battery, Untraced) else battery.play(keys, None)
+            self._reached[at] = clean.moved
         return self._reached[at]
 
     def harm(self, played: Played, reach: Array | None = None) -> tuple[Array, Array]:
@@ -218,6 +222,14 @@ class Arena:
         """Return the share of damaged episodes and the mean score of an attack, as `evaluate` plays it."""
         outcome = self.outcome(text, purpose, first, episodes)
         return float(np.mean(self.harm(*outcome)[0])), float(np.mean(self.score(*outcome)))
+
+    def promising(self, texts: Iterable[str], count: int = LISTED) -> list[str]:
+        """Return the attacks that did most harm on some select episodes; those without a meaning here are left out."""
+        tried = {}
+        for text in dict.fromkeys(texts):
+            with contextlib.suppress(NotApplicable):
+                tried[text] = self.confirmed(text, "select", 0, min(TRIED, FINAL))[1]
+        return sorted(tried, key=lambda one: -tried[one])[:count]
 
     def best(self, texts: Iterable[str]) -> list[Found]:
         """Return attacks after the last stage, on select episodes that they all meet, the most harmful first."""

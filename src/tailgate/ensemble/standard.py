@@ -30,10 +30,9 @@ from tailgate.evaluation.cells import Cell, run
 from tailgate.evaluation.rows import CLEAN
 from tailgate.evaluation.stats import proportion
 
-NAME = "standard-v0"
+NAME = "standard-v1"
 BLACK = tuple(member.name for member in MEMBERS if member.knowledge == "black")
 SHOWN = 3  # attacks of a member that are kept
-TRIED, LISTED = 128, 4  # select episodes of every listed attack; listed attacks that are played on as many as the scripts found
 Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
 
 
@@ -156,13 +155,7 @@ def searched(
 
 def _strongest(arena: Arena, attacks: Sequence[str]) -> dict[str, Any] | None:
     """Return the attack that does most harm on select episodes: all are played on some, and the best of these on all."""
-    tried = {}
-    for attack in attacks:
-        try:
-            tried[attack] = arena.confirmed(attack, "select", 0, min(TRIED, FINAL))[1]
-        except NotApplicable:
-            continue
-    played = {attack: arena.confirmed(attack, "select", 0, FINAL) for attack in sorted(tried, key=lambda one: -tried[one])[:LISTED]}
+    played = {attack: arena.confirmed(attack, "select", 0, FINAL) for attack in arena.promising(attacks)}
     best = max(played, key=lambda attack: played[attack][1], default=None)
     return None if best is None else {"attack": best, "damage": played[best][0], "score": played[best][1]}
 
@@ -296,4 +289,3 @@ def _compared(result: dict[str, Any], rows: list[dict[str, Any]], suite: Suite) 
 def attacks_of(report: dict[str, Any]) -> list[str]:
     """Return the attacks that were found, each once, as `tailgate evaluate --attack` takes them."""
     return list(dict.fromkeys(one["attack"] for cell in report["cells"] for one in cell["members"] if one["attack"]))
-
