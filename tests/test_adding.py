@@ -166,6 +166,7 @@ def test_a_plant(extended, tmp_path):
     assert all(json.loads(line)["status"] == "ok" for line in (tmp_path / "rows.jsonl").read_text().splitlines())
 
 
+@pytest.mark.long
 def test_a_learner_and_a_reward(extended, tmp_path):
     small = ["learner=guess", "guess.population=8", "guess.episodes=2", "guess.hidden=[]", "environment.reward=discomfort", "steps=3000", "rivals=[]"]
     extended("-m", "tailgate", "train", *small, "episodes=4", "select_episodes=4", "others=[]", "white_box=[]", "tensorboard=false", "workers=1", f"out={tmp_path}")

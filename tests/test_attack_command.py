@@ -136,6 +136,7 @@ def test_budgets_share_no_file(small_ensemble, tmp_path, monkeypatch):
     assert len(set(texts.values())) == 2
 
 
+@pytest.mark.long
 def test_a_defence_that_is_not_traced(small_ensemble, tmp_path, monkeypatch, capsys):
     """Scripts and programs are played in the plain loop; who needs derivatives or a program says why it does not search."""
     (tmp_path / "branching_defence.py").write_text(

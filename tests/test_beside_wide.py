@@ -77,6 +77,7 @@ def test_what_is_in_the_board() -> None:
 
 
 @pytest.mark.parametrize("guards", [*((guard,) for guard in GUARDS[1:]), ("kf", "safe_state"), ("rkf", "imm", "chi2_kf", "brake_kf"), GUARDS[1:]], ids=",".join)
+@pytest.mark.thin(3)
 def test_rows_beside_a_board_make_what_all_rows_make(guards: tuple[str, ...]) -> None:
     whole = _whole(*GUARDS)
     before = _as_read(_whole(*(guard for guard in GUARDS if guard not in guards)))
@@ -112,6 +113,7 @@ def _sorted(made: Data) -> Data:
 
 @pytest.mark.parametrize("hits", [0, 2, 20])
 @pytest.mark.parametrize("guards", [("safe_state",), ("kf", "imm", "brake_kf"), GUARDS], ids=",".join)
+@pytest.mark.thin(3)
 def test_entries_that_meet_one_attack_more(guards: tuple[str, ...], hits: int) -> None:
     """Its rows alone make what all rows make, whether it does the most or nothing; another entry may join at once."""
     more, before = _more(*guards, hits=hits), _as_read(_whole(*GUARDS))
@@ -127,6 +129,7 @@ def test_entries_that_meet_one_attack_more(guards: tuple[str, ...], hits: int) -
 
 @pytest.mark.parametrize("hits", [0, 2, 20])
 @pytest.mark.parametrize("guards", [("kf",), ("imm", "chi2_kf"), GUARDS], ids=",".join)
+@pytest.mark.thin(3)
 def test_what_was_compared_still_bounds_what_met_more(guards: tuple[str, ...], hits: int) -> None:
     """Where cells do not tell which episodes were hit: p is no smaller than of all rows, and hardly larger where the new attack does little."""
     before, more = _as_read(_whole(*GUARDS)), _more(*guards, hits=hits)

@@ -142,6 +142,7 @@ def test_an_attacker_that_cannot_be_played_costs_its_own_figures_alone(board: Da
     assert [missing.defence for missing in made.without] == ["rkf", "mewma_kf"] and all(missing.why for missing in made.without)
 
 
+@pytest.mark.long
 def test_the_command_writes_the_file_and_the_pages_show_it(board: Data, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "quick-v0"
     folder.mkdir()

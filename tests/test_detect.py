@@ -174,6 +174,7 @@ def test_a_class_of_somebody_s_own_is_played_where_it_is_named(tmp_path: Path, m
     assert done.returncode == 2 and "mine_detected:Mine: digest" in done.stderr
 
 
+@pytest.mark.long
 def test_workers_change_no_figure(bare: Data, detected: Data, tmp_path: Path) -> None:
     path = _written(bare, tmp_path)
     assert detect(path, QUICK, effort=EFFORT, workers=2) == detected == json.loads(path.read_text())

@@ -192,6 +192,16 @@ def test_starts(monkeypatch):
     assert [start.name for start in starts_of(place, "black", [script], 0, names[3:5])[:2]] == names[3:5]
 
 
+def test_a_published_start_keeps_its_kinds(tmp_path):
+    """A published policy that learned with fewer kinds than are granted goes on with its own, and its file says so."""
+    place = arena("car")
+    start = next(one for one in starts_of(place, "black", [], 0) if one.name.startswith("zoo"))
+    wanted, attacks = as_evaluated(place, Evolution(place, "black", start, 8, 0).write(tmp_path, 0))
+    assert attacks
+    again, _ = as_evaluated(place, f"zoo:name={start.name.partition(' ')[2]}")
+    np.testing.assert_array_equal(wanted.gap, again.gap)
+
+
 def test_a_ramp_is_learned_in_its_steps():
     """A ramp says the first value and the rate; a script of one size begins at half of it; a hold has no value that could grow."""
     place = arena("car", threat={"kinds": ("dos_hold", "fdi"), "fdi_bound": 4.0})

@@ -78,6 +78,7 @@ def test_the_row_of_a_genome_is_its_text(same_bits):
 # The search
 
 
+@pytest.mark.long
 def test_a_road_alone_is_worse_than_as_many_random_ones():
     every = " + ".join(f"gap@{i}" for i in range(1, 5))
     case = dataclasses.replace(ROAD, scenario="platoon-gusty-v0", defence="dkf", formula=f"G[0,0.1] {every} > 50")

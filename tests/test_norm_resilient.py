@@ -278,6 +278,7 @@ def _fresh(seed):
     return dataclasses.replace(place, plant=plant, sensor=sensor)
 
 
+@pytest.mark.long
 def test_the_thesis_network_converges_and_withstands_the_attack():
     """Fresh systems, medians: clean to 1 % within 5 to 8 steps; worst error under the attack 1.5 to 3, the linear filter's above 1000."""
     attack, steps, worst = tailgate.make_attack("fdi_gaussian", sd=700.0, chance=0.9), [], {"norm_resilient": [], "dkf": []}

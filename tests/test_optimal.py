@@ -64,6 +64,7 @@ def test_they_are_ceilings():
     [Rules(1, 10, 4, 10, 0), Rules(3, 9, 4, 10, 0), Rules(1, 10, 5, 2, 0), Rules(2, 10, 4, 3, 3), Rules(1, 10, 10, 1, 2), Rules(4, 4, 3, 9, 0)],
 )
 @pytest.mark.parametrize("states, a, seed", [(1, 1.2, 0), (1, 0.7, 0), (2, 1.0, 0), (2, 1.1, 2), (3, 0.95, 1)])
+@pytest.mark.thin(3)
 def test_the_schedule_is_as_good_as_the_best_of_all(states, a, seed, rules, objective):
     """Brute force over all 1024 schedules of ten steps that the threat model accepts."""
     filtering, P = system(a, states, seed), 2.0 * np.eye(states)
@@ -108,6 +109,7 @@ def test_only_what_is_lost_counts():
     assert none < one < both
 
 
+@pytest.mark.long
 def test_what_grows_too_large_says_so():
     """Many states and a tiny slack: the search gives up with a reason instead of running for hours."""
     with pytest.raises(NotApplicable, match="a smaller system or budget"):
@@ -131,6 +133,7 @@ def test_played_losses_are_those_predicted(play):
 
 
 @pytest.mark.parametrize("threat", [{"duration": 3}, {"duration": 2, "cooldown": 4}, {"end": 50, "cooldown": 3}, {"budget": None, "end": 20}])
+@pytest.mark.thin(2)
 def test_the_channel_accepts_every_loss(threat, play):
     """Whatever the threat model limits, nothing is refused and the schedule is used up as far as it may be."""
     trace = play(load_scenario("linear-dos-v0").with_threat(**threat), "kf", "optimal_dos", range(2))
@@ -367,6 +370,7 @@ def test_the_scalar_loop(play):
 @pytest.mark.parametrize("scenario, defence, attack", [
     ("linear-dos-v0", "kf", "optimal_dos"), ("linear-stealth-v0", "chi2_kf", "optimal_stealth"), ("scalar-hold-v0", "none", "optimal_hold"),
 ])
+@pytest.mark.thin(2)
 def test_rows_do_not_depend_on_their_batch(scenario, defence, attack, play):
     """Alone, among 3 or among 32: the same trace to the last bit."""
     place = load_scenario(scenario)

@@ -42,6 +42,7 @@ def played(place, text, attack, seeds, **options):
     ({"scenario": "radar-following-v0", "defence": "cra", "interval": 40}, 8),
     ({"scenario": "thesis-ch5-v0", "defence": "chi2_dkf:eta=22.8", "interval": 10, "reward": "error"}, 6),
 ], ids=["car", "box", "platoon", "challenge", "network"])  # fmt: skip
+@pytest.mark.thin(3)
 def test_pettingzoo_is_content(game, cycles):
     """parallel_api_test and parallel_seed_test pass without a warning, over the end of an episode and on every kind of system."""
     with warnings.catch_warnings():
@@ -56,6 +57,7 @@ def test_pettingzoo_is_content(game, cycles):
     ("stop-and-go-v0", "windowed_chi2_kf", "steered:defence=windowed_chi2_kf"), ("radar-following-v0", "cra", "steered_cra"),
     ("platoon-braking-v0", "chi2_dkf:eta=22.8", "steered:defence=chi2_dkf,defence.eta=22.8"),
 ])  # fmt: skip
+@pytest.mark.thin(3)
 def test_knobs_that_nobody_turns_change_no_bit(place, plain, steered, short):
     """A steered defence at its own values gives the trace of the plain one, and at another setting another trace."""
     scene = short(place, horizon=120)
@@ -106,6 +108,7 @@ def test_rows_are_steered_on_their_own():
 
 
 @pytest.mark.parametrize("interval", [1, 7, 20])
+@pytest.mark.thin(2)
 def test_masks_agree_with_what_the_channel_accepts(interval):
     """In random play no allowed action is refused throughout, and every other one than none is where its mask is 0."""
     threat = {"budget": 25, "duration": 6, "cooldown": 4, "onset": 20, "end": 200}
@@ -190,6 +193,7 @@ def test_payoffs():
     assert terminated["defender"] and info["attacker"]["collided"] and last == [0.0] * (len(last) - 1) + [-1.0]
 
 
+@pytest.mark.long
 def test_a_trained_defender_is_an_ordinary_defence(tmp_path, short):
     """An exported network that always chooses a setting plays as that setting, from text; a pair is drawn by episode, alone or in a batch."""
     duel = Duel.make(**GUSTY)

@@ -159,6 +159,7 @@ def test_topologies():
 
 
 @pytest.mark.parametrize("topology", TOPOLOGIES)
+@pytest.mark.thin(2)
 def test_messages_carry_what_their_names_say(topology):
     """Accelerations of predecessor and leader at this step, what drove the predecessor in the last; 0 from a leader that is not heard."""
     trace = play(place_of(topology=topology, horizon=400), seeds=range(3), terminate=False)
@@ -249,6 +250,7 @@ def test_any_number_of_cars(followers):
     assert not trace.collided.any()
 
 
+@pytest.mark.long
 def test_a_hundred_followers(monkeypatch):
     """They run, the first cars drive as in a short string, and the last ones do not notice the braking of the leader before its time."""
     monkeypatch.setattr("tailgate.envs.plants.platoon.require_detectable", lambda model, where: None)  # slow for so many, and not the point here

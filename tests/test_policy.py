@@ -70,6 +70,7 @@ def test_a_policy_of_several_frames_plays_as_it_was_trained(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("scenario", MANY)
 @pytest.mark.parametrize(("action", "knowledge"), [({"action": "mode", "per_agent": True}, "black"), ({"action": "increment"}, "white")])
+@pytest.mark.thin(2)
 def test_a_policy_of_many_agents_plays_as_it_was_trained(tmp_path: Path, scenario: str, action: dict[str, Any], knowledge: str) -> None:
     _same_trace(tmp_path, action | {"interval": 3}, knowledge, scenario, MANY[scenario])
 

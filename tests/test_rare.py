@@ -147,6 +147,7 @@ def test_an_estimate_agrees_with_plain_episodes():
     assert report["low"] < share < report["high"] and 0.3 * share < report["probability"] < 3.0 * share
 
 
+@pytest.mark.long
 def test_an_estimate_resumes_and_repeats(tmp_path, monkeypatch):
     job = Rare(dataclasses.replace(NOISE, formula="G[10,60] error < 2.5"), 64, 3, 4)
     whole = estimate(job, noise=True)

@@ -31,6 +31,7 @@ def chapter_4(tmp_path_factory):
     return code, {claim["id"]: claim for claim in json.loads(text.getvalue())}, out
 
 
+@pytest.mark.long
 def test_chapter_4(chapter_4):
     """One run of the command: the claims' fields, what has to come out whatever the seeds, and the files."""
     code, claims, out = chapter_4

@@ -158,6 +158,7 @@ def test_the_command_trains_compares_and_writes_a_page(here: Path, tmp_path: Pat
     assert decisions == 1920 and f"{decisions:,} decisions" in (run / "page" / "index.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.long
 def test_a_finished_comparison_is_not_played_again(
     here: Path, tmp_path: Path, small_run: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,6 +2,7 @@
 
 Each worker has a pipe to its parent; workers share no thread, queue or lock.
 A killed worker therefore loses its own job only, and the parent never waits for it.
+Within `hired`, jobs go to other hands, such as a cluster's.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ import threading
 import traceback
 import weakref
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextvars import ContextVar
 from multiprocessing import connection, resource_tracker
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 from tailgate.base import sizes
 from tailgate.base.errors import Killed
@@ -27,6 +29,7 @@ R = TypeVar("R")
 ENDING = 5.0  # [s] for an idle worker to end before it is killed
 _SIGNALS = {signal.SIGINT, signal.SIGTERM}
 _crews: weakref.WeakSet[Crew] = weakref.WeakSet()
+_hired: ContextVar[Callable[[int], Hands] | None] = ContextVar("hired", default=None)  # who takes jobs in place of local workers
 _line: connection.Connection | None = None  # in a worker: the pipe to its parent
 
 
@@ -40,6 +43,30 @@ class Answer(NamedTuple):
     job: int
     word: Literal["said", "done", "failed", "died"]
     value: Any = None
+
+
+class Hands(Protocol):
+    """A context manager that takes jobs and answers them in any order; an error within the block ends them all."""
+
+    def __enter__(self) -> Hands:
+        """Begin."""
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """End."""
+
+    @property
+    def busy(self) -> Sequence[object]:
+        """The jobs that are not answered yet."""
+
+    @property
+    def free(self) -> bool:
+        """If another job can be given."""
+
+    def give(self, job: int, function: Callable[..., object], *arguments: object) -> None:
+        """Give a job by its number."""
+
+    def wait(self) -> list[Answer]:
+        """Return answers; wait for the first one."""
 
 
 class _Worker:
@@ -122,13 +149,39 @@ class Crew:
                 worker.end(0.0)
                 found.append(Answer(job, "died"))
                 continue
-            if word == "failed":
-                value, text = value
-                value.__cause__ = Remote(f"\n{text}")
             if word != "said":
                 worker.job = None
-            found.append(Answer(job, word, value))
+            found.append(answer(job, word, value))
         return found
+
+
+def answer(job: int, word: Any, value: Any) -> Answer:
+    """Return the answer to a job; an error has the worker's traceback as its cause."""
+    if word == "failed":
+        value, text = value
+        value.__cause__ = Remote(f"\n{text}")
+    return Answer(job, word, value)
+
+
+@contextlib.contextmanager
+def hired(hands: Callable[[int], Hands]) -> Iterator[None]:
+    """Give jobs to other hands within a block. hands: called with the number of jobs at a time."""
+    token = _hired.set(hands)
+    try:
+        yield
+    finally:
+        _hired.reset(token)
+
+
+def crew(most: int) -> Hands:
+    """Return who takes up to `most` jobs at a time: local processes, or those that are hired."""
+    hands = _hired.get()
+    return Crew(most) if hands is None else hands(most)
+
+
+def apart(workers: int, jobs: int) -> bool:
+    """If jobs run in other processes: several in several workers, or any in hired hands."""
+    return _hired.get() is not None or min(workers, jobs) > 1
 
 
 def each(
@@ -141,28 +194,28 @@ def each(
     If it dies again, the result is died(number); without `died`, raise Killed.
     """
     lost = []
-    with Crew(workers) as crew:
+    with crew(workers) as hands:
         waiting = deque(enumerate(jobs))
-        while waiting or crew.busy:
-            while waiting and crew.free:
+        while waiting or hands.busy:
+            while waiting and hands.free:
                 number, job = waiting.popleft()
-                crew.give(number, function, *job)
-            for answer in crew.wait():
-                if answer.word == "failed":
-                    raise answer.value
-                if answer.word == "died":
-                    lost.append(answer.job)
+                hands.give(number, function, *job)
+            for found in hands.wait():
+                if found.word == "failed":
+                    raise found.value
+                if found.word == "died":
+                    lost.append(found.job)
                 else:
-                    yield answer.job, answer.value
+                    yield found.job, found.value
     for number in sorted(lost):
-        with Crew(1) as crew:
-            crew.give(number, function, *jobs[number])
-            (answer,) = crew.wait()
-        if answer.word == "failed":
-            raise answer.value
-        if answer.word == "died" and died is None:
+        with crew(1) as hands:
+            hands.give(number, function, *jobs[number])
+            (found,) = hands.wait()
+        if found.word == "failed":
+            raise found.value
+        if found.word == "died" and died is None:
             raise Killed("workers", "a process that was killed", f"memory for {workers} of them, or fewer; what was finished is kept")
-        yield number, died(number) if died is not None and answer.word == "died" else answer.value
+        yield number, died(number) if died is not None and found.word == "died" else found.value
 
 
 def kill_all() -> None:
@@ -172,9 +225,9 @@ def kill_all() -> None:
 
 
 def say(value: object) -> None:
-    """Send the parent a message about the current job. Call it in a worker only."""
-    assert _line is not None
-    _line.send(("said", value))
+    """Send the parent a message about the current job. Call it in a worker only; hired hands have nobody to tell."""
+    if _line is not None:
+        _line.send(("said", value))
 
 
 def _serve(pipe: connection.Connection, path: list[str]) -> None:
@@ -199,10 +252,18 @@ def _answer(pipe: connection.Connection) -> None:
         pipe.send(("failed", _portable(error)))
         return
     try:
-        answer = connection._ForkingPickler.dumps(("done", function(*arguments)))  # type: ignore[attr-defined]
-    except Exception as error:
+        answer = connection._ForkingPickler.dumps(done(function, arguments))  # type: ignore[attr-defined]
+    except Exception as error:  # a result that cannot be sent
         answer = connection._ForkingPickler.dumps(("failed", _portable(error)))  # type: ignore[attr-defined]
     pipe.send_bytes(answer)
+
+
+def done(function: Callable[..., object], arguments: tuple[object, ...]) -> tuple[str, object]:
+    """Do a job; return the word and the value of its answer."""
+    try:
+        return "done", function(*arguments)
+    except Exception as error:
+        return "failed", _portable(error)
 
 
 def _portable(error: Exception) -> tuple[Exception, str]:

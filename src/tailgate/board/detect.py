@@ -13,7 +13,7 @@ from typing import Any
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
 from tailgate.base.locks import alone
-from tailgate.base.pool import each
+from tailgate.base.pool import apart, each
 from tailgate.base.version import VERSION
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite
@@ -159,7 +159,7 @@ def _play(
     every = [*asked, *have]
     sizes.check("workers", workers)
     update, rest = progress or (lambda *_: None), (attacks, effort, beacon)
-    if workers == 1 or len(every) < 2:
+    if not apart(workers, len(every)):
         ticks = 2 * len(effort.hours)  # of an entry: the stealth attack and the others at each threshold
         for i, defence in enumerate(every):
             steps = itertools.count(i * ticks + 1)

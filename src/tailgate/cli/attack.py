@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from tailgate.base import sizes
-from tailgate.cli.shared import Commands, own_classes, working
+from tailgate.cli.shared import Commands, add_options, own_classes, working
 
 
 def add(actions: Commands) -> None:
@@ -25,6 +25,7 @@ def add(actions: Commands) -> None:
     command.add_argument("--episodes", type=int, metavar="N", help="report episodes per cell instead of the suite's")
     command.add_argument("--beacon", default="", metavar="TEXT", help="the round of the board: its seeds are played")
     command.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2); change no result")
+    add_options(command, "--engine", "--address")
     command.add_argument("--set", action="append", default=[], metavar="key=value", help="change the training (repeatable): steps=10000")
     command.set_defaults(run=_attack, kept="the same command goes on")
 

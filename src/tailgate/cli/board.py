@@ -32,6 +32,7 @@ def add(actions: Commands) -> None:
     command.add_argument("--attack", action="append", metavar="TEXT",
                          help="only these attacks, which the entries that --keep-entries keeps have not met (repeatable)")  # fmt: skip
     command.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2); change no result")
+    add_options(command, "--engine", "--address")
     command.add_argument("--beacon", default="", metavar="TEXT", help="the round: random text of after the submissions (default: none)")
     command.add_argument("--score-only", action="store_true", help="play nothing: score the rows that are there")
     command.add_argument("--keep-entries", action="store_true",

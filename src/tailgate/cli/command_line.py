@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from typing import Any, NoReturn
 
@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _done(arguments: Sequence[str] | None, chosen: argparse.Namespace, ending: Ending) -> int:
     try:
         _parser().parse_args(arguments, chosen)
-        with _device(chosen):
+        with _place(chosen):
             return int(chosen.run(chosen))
     except InputError as error:
         print(f"tailgate: error: {error}", file=sys.stderr)
@@ -54,13 +54,22 @@ def _done(arguments: Sequence[str] | None, chosen: argparse.Namespace, ending: E
         return 0
 
 
-def _device(chosen: argparse.Namespace) -> AbstractContextManager[None]:
-    """Play on the device that a command was given."""
-    if getattr(chosen, "device", "cpu") == "cpu":
-        return nullcontext()
-    from tailgate.engine.cards import playing_on
+@contextmanager
+def _place(chosen: argparse.Namespace) -> Iterator[None]:
+    """Play on the device, and where the workers run, that a command was given."""
+    engine, address = getattr(chosen, "engine", "local"), getattr(chosen, "address", None)
+    if address is not None and engine != "ray":
+        raise InputError("--address", address, "--engine ray with it")
+    with ExitStack() as stack:
+        if getattr(chosen, "device", "cpu") != "cpu":
+            from tailgate.engine.cards import playing_on
 
-    return playing_on(chosen.device)
+            stack.enter_context(playing_on(chosen.device))
+        if engine == "ray":
+            from tailgate.base.cluster import on_ray
+
+            stack.enter_context(on_ray(address, chosen.workers))
+        yield
 
 
 def _kept(chosen: argparse.Namespace) -> str:

@@ -23,6 +23,7 @@ def add(actions: Commands) -> None:
     command.add_argument("--defence", action="append", default=[], metavar="NAME",
                          help="only these entries (repeatable); module:Class of the board is imported when it is named here")  # fmt: skip
     command.add_argument("--workers", type=int, default=2, metavar="N", help="processes, an entry each (default 2); change no result")
+    add_options(command, "--engine", "--address")
     command.add_argument("--hours", action="append", type=float, metavar="H",
                          help="mean time between false alarms [h] (repeatable; default 0.1, 1 and 10)")  # fmt: skip
     command.add_argument("--episodes", type=int, metavar="N", help="episodes of a scenario and an attack (default 100)")

@@ -25,6 +25,7 @@ def add(commands: Commands) -> None:
     command.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the search (default 0)")
     command.add_argument("--episodes", type=int, default=400, metavar="N", help="report episodes per comparison (default 400)")
     command.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2); change no result")
+    add_options(command, "--engine", "--address")
     command.add_argument("--out", metavar="DIR", help="write attack.json, attacks.txt, programs, policies and rows here; resumes")
     add_options(command, "--json")
     command.set_defaults(run=_attack)

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 from tailgate.base import sizes
-from tailgate.cli.shared import Commands, own_classes, print_json, say, tell, working
+from tailgate.cli.shared import Commands, add_options, own_classes, print_json, say, tell, working
 
 FIELDS = ("defence", "status", "why", "rank", "class", "gates", "critical_dose", "rates", "flags")
 
@@ -26,6 +26,7 @@ def add(actions: Commands) -> None:
     command.add_argument("--board", metavar="FILE", help="board that it joins (default: the published one of the suite)")
     command.add_argument("--out", default="tried", metavar="DIR", help="rows, attackers and page (default: tried)")
     command.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2); change no result")
+    add_options(command, "--engine", "--address")
     command.add_argument("--json", action="store_true", help="print the entry as JSON")
     command.set_defaults(run=_try, kept="the same command goes on")
 

@@ -45,7 +45,7 @@ def add(commands: Commands) -> None:
     command.add_argument("--beacon", default="", metavar="TEXT", help="the round of a board: its seeds are played")
     add_options(command, "--purpose")
     command.add_argument("--batch", type=int, default=2048, metavar="N", help="episodes side by side (default 2048); changes no result")
-    add_options(command, "--workers", "--device")
+    add_options(command, "--workers", "--device", "--engine", "--address")
     command.add_argument("--out", metavar="DIR", help="write cells.jsonl, trust.json and the worst failing runs here; resumes")
     add_options(command, "--json")
     command.set_defaults(run=_trust)

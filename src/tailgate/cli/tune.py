@@ -30,6 +30,7 @@ def add(commands: Commands) -> None:
     command.add_argument("--episodes", type=int, default=400, metavar="N", help="episodes that a trial is measured on (default 400)")
     command.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the search itself (default 0)")
     command.add_argument("--workers", type=int, default=1, metavar="N", help="trials at a time (default 1); more change what is proposed")
+    add_options(command, "--engine", "--address")
     add_options(command, "--json")
     command.add_argument("overrides", nargs="*", metavar="key=value", help="change a field of the configuration, as for `tailgate train`")
     command.set_defaults(run=_tune, kept="the same command goes on")

@@ -181,7 +181,7 @@ class Evolution:
         weights, biases = zip(*self.shape.layers(self.champion[1]), strict=True)
         training: dict[str, Any] = {
             "summary": "learned by the standard attack ensemble", "start": self.start.name, "seed": seed, "episodes": self.episode,
-            "config": {"scenario": arena.scenario, "threat": dict(arena.threat)}, "threat_model": as_data(self.loop.threat),
+            "config": {"scenario": arena.scenario, "threat": dict(arena.threat)}, "threat_model": as_data(plan.action.brief.threat),
         }  # fmt: skip
         if not Spec("defence", arena.defence).imports:  # a file shall not name somebody's class
             training["config"]["defence"] = arena.defence

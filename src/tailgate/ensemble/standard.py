@@ -17,7 +17,7 @@ from tailgate.base import sizes, sources
 from tailgate.base.errors import InputError, NotApplicable, said, unknown
 from tailgate.base.files import writable_directory, write_atomic
 from tailgate.base.locks import alone
-from tailgate.base.pool import each
+from tailgate.base.pool import apart, each
 from tailgate.base.reading import load_json
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_scenario
@@ -143,7 +143,7 @@ def searched(
         best = _best(result)
         update("searches", len(done), len(jobs), f"{result['scenario']}: {best['damage']:.0%} by {best['attack']}" if best else "")
 
-    if workers > 1 and len(left) > 1:
+    if apart(workers, len(left)):
         for number, result in each(one, [(jobs[i], folder) for i in left], workers):
             finish(left[number], result)
     else:

@@ -20,7 +20,7 @@ import numpy as np
 from tailgate.base import sizes, sources
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.files import write_atomic
-from tailgate.base.pool import each
+from tailgate.base.pool import apart, each
 from tailgate.base.reading import YAML_ENDS
 from tailgate.base.version import VERSION
 from tailgate.core import Attack, Defence, Model, draws
@@ -242,7 +242,7 @@ def run(
 
 def _play(cells: Sequence[Cell], workers: int) -> Generator[tuple[int, list[dict[str, Any]]]]:
     foreign = any(Spec("defence", cell.defence).imports or Spec("attack", cell.attack).imports for cell in cells)
-    if device() != "cpu" or (not foreign and (workers == 1 or len(cells) < 2)):
+    if device() != "cpu" or not (foreign or apart(workers, len(cells))):
         for i, cell in enumerate(cells):
             yield i, run_cell(cell)
         return

@@ -10,7 +10,7 @@ from typing import Any
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
-from tailgate.base.pool import each
+from tailgate.base.pool import apart, each
 from tailgate.core.scenario import Suite, load_suite
 from tailgate.evaluation.attack_list import attacks_of
 from tailgate.evaluation.cells import Cell, cells_of
@@ -93,7 +93,7 @@ def _run(
 
 
 def _play(jobs: Sequence[Sequence[Cell]], submission: Submission, seeds: list[int], workers: int) -> Generator[tuple[int, Rows]]:
-    if workers == 1 or len(jobs) < 2:
+    if not apart(workers, len(jobs)):
         for i, job in enumerate(jobs):
             yield i, play_mixed(job, submission, seeds)
         return

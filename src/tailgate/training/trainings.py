@@ -15,7 +15,7 @@ from tailgate.agents.learners.learning import Config, Learner, Progress, Teachab
 from tailgate.agents.learners.teacher import demonstrate
 from tailgate.base.errors import InputError, Killed, said
 from tailgate.base.files import write_atomic
-from tailgate.base.pool import Crew, say
+from tailgate.base.pool import apart, crew, say
 from tailgate.base.reading import load_json
 from tailgate.core.registry import Spec
 from tailgate.core.schema import as_data
@@ -55,7 +55,7 @@ def train_all(trainings: Sequence[Training], begin: Callable[[Training], None], 
     begin: called with each, before anything of it is done. Where one fails, those that have begun end, no other begins, and the error
     names it.
     """
-    if min(workers, len(trainings)) > 1:
+    if apart(workers, len(trainings)):
         return _train_apart(trainings, begin, progress, min(workers, len(trainings)))
     paths = []
     for training in trainings:
@@ -142,13 +142,13 @@ def _train_apart(trainings: Sequence[Training], begin: Callable[[Training], None
     waiting = list(enumerate(trainings))
     paths: dict[int, Path] = {}
     failed: BaseException | None = None
-    with Crew(workers) as crew:
-        while crew.busy or (waiting and failed is None):
-            while waiting and failed is None and crew.free:
+    with crew(workers) as hands:
+        while hands.busy or (waiting and failed is None):
+            while waiting and failed is None and hands.free:
                 place, training = waiting.pop(0)
                 begin(training)
-                crew.give(place, _train_in_child, training)
-            for answer in crew.wait():
+                hands.give(place, _train_in_child, training)
+            for answer in hands.wait():
                 if answer.word == "said":
                     progress(trainings[answer.job], answer.value)
                 elif answer.word == "done":

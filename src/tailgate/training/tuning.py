@@ -34,7 +34,7 @@ from tailgate.base import sizes
 from tailgate.base.errors import InputError, said, unknown
 from tailgate.base.files import writable_directory, write_atomic
 from tailgate.base.locks import alone
-from tailgate.base.pool import each
+from tailgate.base.pool import apart, each
 from tailgate.base.reading import lines_of, parse_json
 from tailgate.core import draws
 from tailgate.core.registry import Spec
@@ -306,7 +306,7 @@ def _tuned(search: Search, workers: int, progress: Callable[[int, Progress | Non
     study = _begin(search)
     settled = {entry["ordinal"] for entry in _entries(study) if entry["state"] == "complete" or entry["reason"]}
     missing = [i for i in range(search.trials) if i not in settled]
-    if workers == 1 or len(missing) < 2:
+    if not apart(workers, len(missing)):
         for ordinal in missing:
             _trial(search, ordinal, progress)
     else:

@@ -20,7 +20,7 @@ from tailgate.base import sizes
 from tailgate.base.errors import InputError
 from tailgate.base.files import remove, set_aside, sweep, writable_directory, write_atomic
 from tailgate.base.locks import alone
-from tailgate.base.pool import each
+from tailgate.base.pool import apart, each
 from tailgate.base.reading import lines_of, parse_json
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_scenario
@@ -109,7 +109,7 @@ def _read(path: Path) -> list[Row]:
 def _played(jobs: Sequence[Job], workers: int) -> Generator[Row]:
     """Play, and yield rows as they are finished. Imported code plays in a separate process."""
     foreign = any(Spec("defence", job.cell.defence).imports or Spec("attack", job.cell.attack).imports for job in jobs)
-    if device() != "cpu" or (not foreign and (workers == 1 or len(jobs) < 2)):
+    if device() != "cpu" or not (foreign or apart(workers, len(jobs))):
         yield from map(check_cell, jobs)
         return
     died = "the process that played this cell died"

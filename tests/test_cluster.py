@@ -1,0 +1,96 @@
+"""Jobs on a Ray cluster of two processes on this machine: the same results as of local workers, lost ones are played again."""
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from tailgate import cli
+from tailgate.base import cluster, pool, sources
+from tailgate.base.errors import InputError
+from tailgate.base.pool import each
+
+
+@pytest.fixture(scope="module")
+def on_ray():
+    pytest.importorskip("ray")
+    with cluster.on_ray(workers=2):
+        yield
+
+
+def squared(number):
+    if number < 0:
+        raise InputError("number", number, "one that is not negative")
+    return number * number
+
+
+def killed_at_first(folder, times):
+    """Die as often as that, as a node does that is lost; then say how often."""
+    path = Path(folder) / "tries"
+    tries = len(path.read_text()) if path.is_file() else 0
+    path.write_text("x" * (tries + 1))
+    if tries < times:
+        os._exit(1)
+    return tries
+
+
+def test_jobs_are_answered_with_their_numbers(on_ray):
+    assert sorted(each(squared, [(i,) for i in range(7)], 3)) == [(i, i * i) for i in range(7)]
+
+
+def test_an_error_comes_back_as_it_was_with_the_traceback_of_the_node(on_ray):
+    with pytest.raises(InputError, match="number: got -1; expected one that is not negative") as found:
+        list(each(squared, [(3,), (-1,)], 2))
+    assert "in squared" in str(found.value.__cause__)
+
+
+def test_a_lost_job_is_given_again(on_ray, tmp_path):
+    assert list(each(killed_at_first, [(str(tmp_path), cluster.RETRIES)], 2)) == [(0, cluster.RETRIES)]
+
+
+def test_a_job_that_kills_every_worker_costs_itself_only(on_ray, tmp_path):
+    (tmp_path / "other").mkdir()
+    jobs = [(str(tmp_path), 10_000), (str(tmp_path / "other"), 0)]
+    assert dict(each(killed_at_first, jobs, 2, lambda number: "died")) == {0: "died", 1: 0}
+
+
+def test_another_version_on_a_node_is_refused(on_ray, monkeypatch):
+    monkeypatch.setattr(sources, "own", lambda: "another")
+    with pytest.raises(InputError, match="the same version of tailgate on every node"):
+        list(each(squared, [(1,)], 2))
+
+
+def test_an_unfinished_round_leaves_no_job(on_ray):
+    with cluster.RayCrew(sys.modules["ray"], 2) as crew:
+        crew.give(0, squared, 2)
+        assert len(crew.busy) == 1 and crew.free
+    assert not crew.busy
+
+
+def test_rows_are_those_of_local_workers(on_ray, tmp_path):
+    """The whole way of a suite's cells: rows arrive as they end, and are equal."""
+    words = ["evaluate", "--suite", "quick-v0", "--scenario", "gusty-stop-and-go-v0", "--defence", "kf", "--defence", "chi2_kf",
+             "--attack", "none", "--attack", "fdi:trigger=near,threshold=40,value=-4", "--seeds", "3", "--json"]  # fmt: skip
+    assert cli.main([*words, "--out", str(tmp_path / "away.jsonl")]) == 0
+    with pool.hired(pool.Crew):
+        assert cli.main([*words, "--out", str(tmp_path / "here.jsonl")]) == 0
+    assert (tmp_path / "away.jsonl").read_bytes() == (tmp_path / "here.jsonl").read_bytes()
+
+
+def test_without_ray_one_line_says_which_extra(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    assert cli.main(["evaluate", "--engine", "ray", "--seeds", "1"]) == 2
+    assert capsys.readouterr().err.strip() == "tailgate: error: a cluster needs Ray: pip install 'tailgate[ray]'"
+
+
+def test_an_address_asks_for_the_engine(capsys):
+    assert cli.main(["evaluate", "--address", "head:6379"]) == 2
+    assert "--address: got 'head:6379'; expected --engine ray" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("address", ["localhost:1", "nowhere", "nowhere.invalid:6379"])
+def test_a_cluster_that_does_not_answer_is_one_clear_error(address, capsys):
+    pytest.importorskip("ray")
+    assert cli.main(["evaluate", "--engine", "ray", "--address", address, "--seeds", "1"]) == 2
+    assert f"--address: got '{address}'; expected HOST:PORT of a Ray cluster that answers" in capsys.readouterr().err
