@@ -72,8 +72,8 @@ def _print(found: list[dict[str, Any]]) -> None:
             budget = "unlimited" if held["budget"] is None else str(held["budget"])
             sizes = (_number(held[name], held["most"]) for name in ("largest", "without_limits"))
             line = (", ".join(held["targets"]), budget, *sizes, f"{held['calm']['gap']:.4g}")
-            columns = ("wires", "steps", "largest injection that is safe", "if the command had no limits", "least gap without an attack")
-            table(columns, [line], f"{report['scenario']}, kf: reachable sets over {held['steps']} steps", words)
+            heads = ("wires", "steps", "largest injection that is safe", "if the command had no limits", "least gap without an attack")
+            table(heads, [line], f"{report['scenario']}, kf: reachable sets over {held['steps']} steps", words)
         if (held := report.get("delay")) is not None:
             say(f"{report['scenario']}: a message may be late by {_number(held['largest'])} steps of {held['dt']:g} s (tried up to "
                 f"{held['tried'][-1]['delay']}), the limits of the command aside")  # fmt: skip

@@ -43,9 +43,8 @@ def admissible(safe: SafeDistance, gap: Array, speed: Array, lead_speed: Array) 
 def reacting(place: Scenario) -> SafeDistance:
     """Return the numbers of the invariant in a scenario.
 
-    A first-order lag tau counts as that much longer reaction. Compare a car whose acceleration goes from at most a towards -b by the lag
-    with one that accelerates with a for tau, then brakes with b. The second is never slower. A leader that brakes softer than the car counts
-    as one that may brake as hard.
+    A first-order lag tau counts as that much longer reaction: a car that accelerates with a for tau, then brakes with b, is never slower
+    than the lagged one. A leader that brakes softer than the car counts as one that may brake as hard.
 
     Raises
     ------
