@@ -43,7 +43,7 @@ def admissible(safe: SafeDistance, gap: Array, speed: Array, lead_speed: Array) 
 def reacting(place: Scenario) -> SafeDistance:
     """Return the numbers of the invariant in a scenario.
 
-    A first-order lag tau counts as that much longer reaction: a car that accelerates with a for tau, then brakes with b, is never slower
+    A first-order lag tau counts as that much longer reaction. A car that accelerates with a for tau, then brakes with b, is never slower
     than the lagged one. A leader that brakes softer than the car counts as one that may brake as hard.
 
     Raises
