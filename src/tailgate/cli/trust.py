@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from tailgate.base.errors import InputError
 from tailgate.base.files import aside
+from tailgate.cli.automata import add_automata, run_automata
 from tailgate.cli.prove import add_prove, run_prove
 from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, tell, values, working
 from tailgate.core.schema import scalar
@@ -50,6 +51,7 @@ def add(commands: Commands) -> None:
     command.add_argument("--out", metavar="DIR", help="write cells.jsonl, trust.json and the worst failing runs here; resumes")
     add_options(command, "--json")
     add_prove(command)
+    add_automata(command)
     command.set_defaults(run=_trust)
 
 
@@ -94,6 +96,8 @@ def _trust(options: argparse.Namespace) -> int:
     from tailgate.trust.signals import SafeDistance
     from tailgate.trust.statistics import runs_for
 
+    if options.automata is not None:
+        return run_automata(options)
     if options.prove:
         return run_prove(options)
     own_classes()
