@@ -164,6 +164,11 @@ class Scene(NamedTuple):
     position: Array
     lane: Lane | None = None
 
+    def road(self, row: int, agent: int) -> dict[str, float]:
+        """Return the numbers of one agent in one row, by name; those of a lane apart."""
+        leaves: dict[str, Array] = {name: leaf for name, leaf in self._asdict().items() if name != "lane"}
+        return {name: float(leaf[row, agent]) for name, leaf in leaves.items()}
+
 
 class Received(NamedTuple):
     """The readings and messages that arrive over the wires in one step, each leaf (B, N, .).

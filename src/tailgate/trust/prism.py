@@ -8,8 +8,9 @@ from tailgate.base.files import write_atomic
 from tailgate.trust.ctmc import Architecture
 
 _WORDS = """
-A bool clock const ctmc C double dtmc E endinit endinvariant endmodule endobservables endrewards endsystem false formula filter func F global
-G init invariant I int label max mdp min module X nondeterministic observable observables of Pmax Pmin P pomdp popta probabilistic prob pta
+A bool clock const ctmc C double dtmc E endinit endinvariant endmodule endobservables endrewards endsystem false formula filter func F
+global G init
+invariant I int label max mdp min module X nondeterministic observable observables of Pmax Pmin P pomdp popta probabilistic prob pta
 rate rewards Rmax Rmin R S stochastic system true U W
 """
 KEYWORDS = frozenset(_WORDS.split())
