@@ -12,6 +12,7 @@ from tailgate.base.errors import InputError
 from tailgate.evaluation.stats import proportion
 from tailgate.thesis.ch7_automata import as_guards, closed_form
 from tailgate.trust.automata import Atom, Query, load_network, network_of
+from tailgate.trust.ctmc import load_architecture, solve
 from tailgate.trust.simulate import simulate
 
 LEVEL = 0.999
@@ -232,10 +233,12 @@ def test_the_examples_of_the_documentation(tmp_path, capsys, monkeypatch):
     pytest.importorskip("matplotlib")
     monkeypatch.chdir(tmp_path)
     text = (Path(__file__).parents[1] / "docs/automata.md").read_text(encoding="utf-8")
-    (yaml,), codes = (re.findall(rf"```{kind}\n(.*?)```", text, re.DOTALL) for kind in ("yaml", "python"))
+    (yaml, chain), codes = (re.findall(rf"```{kind}\n(.*?)```", text, re.DOTALL) for kind in ("yaml", "python"))
     (tmp_path / "door.yaml").write_text(yaml, encoding="utf-8")
     hit = simulate(load_network(str(tmp_path / "door.yaml")), range(300)).hit[0]
     assert np.nanmin(hit) > 0.5 and 0.3 < np.isfinite(hit).mean() < 0.95 and np.nanmax(hit) < 2.0
+    (tmp_path / "chain.yaml").write_text(chain, encoding="utf-8")
+    assert solve(load_architecture(str(tmp_path / "chain.yaml")))["states"] == 4
     for code in codes:
         exec(code.replace("400", "20"), {})
     assert "<>[<= 1000] time < 100 and obs = 1" in capsys.readouterr().out

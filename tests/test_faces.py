@@ -180,7 +180,7 @@ def test_row_i_is_the_single_environment_of_seed_s_plus_i(name, action, interval
 def test_next_step_same_step_and_disabled_are_one_core(name, tiny, same_bits):
     """NEXT_STEP spends a step on the reset, SAME_STEP reports the last observation as final_obs, DISABLED waits for a mask."""
     modes = ("next_step", "same_step", "disabled")
-    faces = {mode: AdversaryVectorEnv(6, autoreset=mode, **(FACES[name] | tiny[name]), value=-20.0) for mode in modes}
+    faces = {mode: AdversaryVectorEnv(6, autoreset=mode, **(FACES[name] | tiny[name] | {"value": -20.0})) for mode in modes}
     for mode, face in faces.items():
         assert face.metadata["autoreset_mode"] == AutoresetMode[mode.upper()]
         face.reset(seed=3)

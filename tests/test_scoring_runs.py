@@ -126,13 +126,13 @@ TALKING = {
     "dkf", "norm_resilient", "lasso_dkf", "chi2_dkf", "saturated_dkf", "disagreement_dkf", "trust_dkf", "consensus_kf", "trimmed_consensus", "centralised_kf",
     "centralised_lasso", "dkf_oracle",
 }  # fmt: skip
-STEERING = {"always_brake", "stand_still", "brake_kf", "widen_kf"}  # in a network nobody drives
+STEERING = {"always_brake", "stand_still", "brake_kf", "widen_kf"}  # in a network nobody drives, in a lane nobody brakes
 ALONE = {"imm", "chi2_kf", "chi2_kf_sparse", "windowed_chi2_kf", "cusum_kf", "mewma_kf", "reacquire_kf", "cusum_reacquire_kf", "oracle"}  # lost there, as `kf`
 FAILING = {"windowed_chi2_kf", "widen_kf", "brake_kf"}  # in a platoon, a gate: without an attack
 SLOW = {"filterpy_hinfinity"}  # episode by episode
 
 
-@pytest.mark.parametrize("name", ["quick-v0", "car-following-v0", "platoon-v0", "radar-v0", "network-v0", "thesis-v0", "highway-v0"])
+@pytest.mark.parametrize("name", ["quick-v0", "car-following-v0", "platoon-v0", "radar-v0", "network-v0", "thesis-v0", "highway-v0", "lane-v0"])
 def test_a_suite_plays_every_built_in_defence_that_fits(name) -> None:
     """What it leaves out refuses one of its scenarios, is another one under a second name, has nobody to talk to or hours to go, or is lost without an attack."""
     if name == "highway-v0":
@@ -141,6 +141,7 @@ def test_a_suite_plays_every_built_in_defence_that_fits(name) -> None:
     sizes = {load_scenario(scenario).brief().model.agents for scenario in suite.scenarios}
     out = ALIKE | SLOW | (TALKING if sizes == {1} else set()) | (STEERING | ALONE if suite.bound is not None else set())
     out |= FAILING if name == "platoon-v0" else set()
+    out |= STEERING if name == "lane-v0" else set()  # a mode changes nothing
     listed = {text.split(":")[0] for text in suite.defences}
     assert not listed & out
     others = [text for text in entries("defence") if text not in listed | out]

@@ -25,6 +25,10 @@ TINY = {  # scenarios of 40 steps, short enough for many episodes
         "controller": "none", "manoeuvre": {"name": "constant", "value": 0.0}, "horizon": 40,
         "threat_model": {"kinds": KINDS, "agents": [0, 2], "onset": 3},
     },
+    "tailgate/LaneKeeping-v0": {
+        "plant": {"name": "lane_keeping", "half_lane": 0.7}, "sensor": "lane_camera", "controller": {"name": "lane_lqr", "margin": 0.7},
+        "horizon": 40, "manoeuvre": "curves", "threat_model": {"kinds": KINDS, "onset": 3},
+    },
     "tailgate/Highway-v0": {
         "plant": {"name": "highway", "lanes": 2, "ahead": 1}, "sensor": "fmcw_radar", "controller": "acc_radar", "horizon": 40,
         "manoeuvre": {"name": "constant", "value": 0.0}, "threat_model": {"kinds": KINDS, "onset": 3},

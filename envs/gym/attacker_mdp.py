@@ -19,7 +19,7 @@ from tailgate.core.schema import as_data, build, digest, fields_of
 from tailgate.core.threat import ThreatModel
 from tailgate.envs.gym.actions import ActionCodec, ActionSpec
 from tailgate.envs.gym.observations import FRAMES, ObservationCodec
-from tailgate.envs.gym.rewards import Reward
+from tailgate.envs.gym.rewards import NEAR, Reward
 
 CAR_FOLLOWING = "tailgate/CarFollowing-v0"
 FACES: dict[str, dict[str, Any]] = {  # defaults of each id
@@ -27,6 +27,7 @@ FACES: dict[str, dict[str, Any]] = {  # defaults of each id
     "tailgate/RadarFollowing-v0": {"scenario": "radar-following-v0", "defence": "cra"},
     "tailgate/Platoon-v0": {"scenario": "platoon-braking-v0", "defence": "lasso_dkf"},
     "tailgate/SensorNetwork-v0": {"scenario": "thesis-ch5-v0", "defence": "norm_resilient", "reward": "error"},
+    "tailgate/LaneKeeping-v0": {"scenario": "lane-keeping-v0", "defence": "chi2_kf", "value": 0.5},
     "tailgate/Highway-v0": {"scenario": "highway-v0", "defence": "chi2_kf"},
 }
 
@@ -159,8 +160,20 @@ class Seat:
 
     def begin(self, state: LoopState) -> Tally:
         """Return the reward's memory of episodes that have just begun."""
-        gap = self.loop.plant.scene(self.loop.plan.plant, state.plant).gap
+        gap = self._room(self.loop.plant.scene(self.loop.plan.plant, state.plant).gap)
         return Tally(self.reward.potential(gap), self.reward.least(gap), np.zeros(len(gap)), np.zeros(len(gap)))
+
+    def _room(self, gap: Array) -> Array:
+        """Return the gap (B, N) [m] that the reward is for: in a lane, half of its width counts as NEAR."""
+        lane = self.loop.model.lane
+        return gap * (NEAR / lane) if lane else gap
+
+    def _believed(self, frame: Frame) -> Array:
+        """Return by how much each agent overestimates that gap (B, N) [m]."""
+        model, x, truth = self.loop.model, frame.estimate.x, frame.truth
+        if not model.lane:
+            return model.gap_error(x, truth)
+        return self._room(np.abs(model.gap_error(truth, np.zeros_like(truth))) - np.abs(model.gap_error(x, np.zeros_like(truth))))
 
     def step(
         self, state: LoopState, tally: Tally, action: Array | Callable[[View], Command], over: Array
@@ -187,12 +200,12 @@ class Seat:
         live = ~over & ~state.ended & (state.k <= loop.horizon)
         view = loop.sense(state)
         state, frame = loop.advance(state, action(view) if callable(action) else self.action.decode(action, view))
-        least, peak, largest = reward.least(frame.scene.gap, tally.least), tally.peak, tally.error
+        gap = self._room(frame.scene.gap)
+        least, peak, largest = reward.least(gap, tally.least), tally.peak, tally.error
         if reward.payment.peak:
             peak = np.maximum(np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1), peak)
         gained = reward(loop.model, frame, tally.least - least, frame.k == loop.horizon, peak - tally.peak)
-        gap_error = loop.model.gap_error(frame.estimate.x, frame.truth)
-        potential = np.where(live, reward.potential(frame.scene.gap, gap_error), tally.potential)
+        potential = np.where(live, reward.potential(gap, self._believed(frame)), tally.potential)
         if not self.road:
             largest = np.where(live, np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1), largest)
         sums = Sums(

@@ -22,6 +22,8 @@ SCALES = {  # what is about 1: steps, metres, metres per second, metres per seco
     "burst": 50.0, "cooldown": 50.0, "gap": 50.0, "speed": 15.0, "lead_speed": 15.0, "closing": 5.0, "accel": 3.0, "rear_gap": 50.0,
     "rear_closing": 5.0, "control": 3.0,
 }  # fmt: skip
+LANE_SCALES = {"rate": 0.5, "curvature": 4e-3, "accel": 3.0, "control": 0.03}  # [m/s], [1/m], [m/s^2], [rad]
+LANE_ERRORS = (0.5, 0.5, 0.05, 0.05)  # offset and its rate [m, m/s], heading and its rate [rad, rad/s]
 LAST_SCALE = 10.0  # of the value sent last, where its bound is larger [unit of the wire]
 T = TypeVar("T")
 
@@ -111,6 +113,8 @@ class ObservationCodec:
     def _road(self, i: int) -> list[Column]:
         """Return what anyone near the road sees of car i."""
         model = self.brief.model
+        if model.lane:
+            return _in_lane(i, model.lane)
         speed: list[Column] = [("speed", lambda s: s.view.scene.speed[:, i] / SCALES["speed"])]
         accel: list[Column] = [("accel", lambda s: s.view.scene.accel[:, i] / SCALES["accel"])]
         if not model.followers[i]:
@@ -144,7 +148,8 @@ class ObservationCodec:
         if len(self.victims) > 1 and i in self.victims:
             out.append(("attacked", lambda s: np.any(s.view.last.target[:, i], axis=1)))
         if self.brief.threat.knowledge != "black" and (model.followers[i] or not model.followers.any()):
-            out += [(f"control{j}", _control(i, j)) for j in range(len(model.actuators))]
+            size = LANE_SCALES["control"] if model.lane else SCALES["control"]
+            out += [(f"control{j}", _control(i, j, size)) for j in range(len(model.actuators))]
         return out
 
     def _errors(self, i: int) -> list[Column]:
@@ -153,7 +158,8 @@ class ObservationCodec:
         if self.brief.threat.knowledge != "white":
             return []
         if self.alone:
-            out: list[Column] = [(f"error{j}", _state_error(i, j)) for j in range(model.states)]
+            sizes = LANE_ERRORS if model.lane else (5.0,) * model.states
+            out: list[Column] = [(f"error{j}", _state_error(i, j, sizes[j])) for j in range(model.states)]
         elif model.followers.any():
             out = [("gap_error", lambda s: _given(s.gap_error)[:, i] / 5.0)] if model.followers[i] else []
             out.append(("speed_error", lambda s: _given(s.speed_error)[:, i] / 5.0))
@@ -199,7 +205,7 @@ class ObservationCodec:
             known = threat.knowledge == "white"
             off: Column = ("noise", lambda s: _given(s.noise)[:, i] / math.sqrt(sum(model.R[i].diagonal().tolist())))
             return [off] if known else [("reading", lambda s: num.log(1.0 + _given(s.reading)[:, i] / self.spread))]
-        sd = [1.0 if self.alone else math.sqrt(model.R[i, j, j]) for j in range(len(model.sensors))]
+        sd = [1.0 if self.alone and not model.lane else math.sqrt(model.R[i, j, j]) for j in range(len(model.sensors))]
         read = {j: truth for j in range(len(model.sensors)) if (truth := self._read(i, j))}
         out: list[Column] = [(f"noise_{model.sensors[j]}", _off(i, j, truth, sd[j])) for j, truth in read.items()]
         if model.air:
@@ -212,6 +218,8 @@ class ObservationCodec:
         if model.air and model.sensors[j] == "relative_speed":
             return "relative_speed"
         assert model.gap is not None and model.speed is not None
+        if model.lane:
+            return "offset" if np.array_equal(-model.gap[i], model.C[i, j]) else ""
         rows = {"gap": model.gap[i], "position": -model.gap[i], "speed": model.speed[i]}
         return next((name for name, row in rows.items() if row.any() and np.array_equal(row, model.C[i, j])), "")
 
@@ -253,6 +261,17 @@ class ObservationCodec:
         return sight
 
 
+def _in_lane(i: int, lane: float) -> list[Column]:
+    """Return what anyone near the road sees of car i in a lane of half width `lane` [m]."""
+    return [
+        ("offset", lambda s: _given(s.view.scene.lane).offset[:, i] / lane),
+        ("rate", lambda s: _given(s.view.scene.lane).rate[:, i] / LANE_SCALES["rate"]),
+        ("curvature", lambda s: _given(s.view.scene.lane).curvature[:, i] / LANE_SCALES["curvature"]),
+        ("lateral_accel", lambda s: s.view.scene.accel[:, i] / LANE_SCALES["accel"]),
+        ("gap", lambda s: s.view.scene.gap[:, i] / lane),
+    ]
+
+
 def _given(value: T | None) -> T:
     """Return the grants of the threat model."""
     assert value is not None
@@ -280,12 +299,12 @@ def _radiated(i: int, kind: Kind, most: float) -> Callable[[Sight], Array]:
     return lambda s: np.where(s.view.last.kind == kind, np.max(s.view.last.value[:, i], axis=1) / most, 0.0)
 
 
-def _control(i: int, j: int) -> Callable[[Sight], Array]:
-    return lambda s: _given(s.view.control)[:, i, j] / SCALES["control"]
+def _control(i: int, j: int, scale: float) -> Callable[[Sight], Array]:
+    return lambda s: _given(s.view.control)[:, i, j] / scale
 
 
-def _state_error(i: int, j: int) -> Callable[[Sight], Array]:
-    return lambda s: (_given(s.view.estimate).x[:, i, j] - _given(s.view.truth)[:, i, j]) / 5.0
+def _state_error(i: int, j: int, scale: float) -> Callable[[Sight], Array]:
+    return lambda s: (_given(s.view.estimate).x[:, i, j] - _given(s.view.truth)[:, i, j]) / scale
 
 
 def _off(i: int, j: int, truth: str, sd: float) -> Callable[[Sight], Array]:
@@ -293,7 +312,7 @@ def _off(i: int, j: int, truth: str, sd: float) -> Callable[[Sight], Array]:
 
     def off(s: Sight) -> Array:
         scene, received = s.view.scene, _given(s.view.received)
-        true = scene.lead_speed - scene.speed if truth == "relative_speed" else getattr(scene, truth)
+        true = scene.lead_speed - scene.speed if truth == "relative_speed" else getattr(scene.lane if truth == "offset" else scene, truth)
         return np.where(received.valid[:, i, j], (received.y[:, i, j] - true[:, i]) / sd, 0.0)
 
     return off

@@ -222,7 +222,8 @@ class Highway:
     def scene(self, plan: HighwayPlan, state: HighwayState) -> Scene:
         (x, v), seen = self._own(state), state.seen
         shown = (seen.gap, v, state.accel, seen.lead_v, seen.rear_gap, seen.rear_v, x)
-        return Scene(*(each[:, None] for each in shown))
+        gap, speed, accel, ahead, rear_gap, rear_speed, position = (each[:, None] for each in shown)
+        return Scene(gap, speed, accel, ahead, rear_gap, rear_speed, position)
 
     def v2v(self, plan: HighwayPlan, state: HighwayState) -> Array:
         return np.zeros((len(state.over), 1, 0))

@@ -122,7 +122,7 @@ def belief(canvas: Canvas, gap: float, believed: float, scale: float, words: str
 def draw(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Array:
     """Return (H, W, 3) uint8: row `row` after `frame`. frame is None right after a reset, also of other rows."""
     at, model = (row, AGENT), loop.model
-    road = {name: float(leaf[at]) for name, leaf in loop.plant.scene(loop.plan.plant, state.plant)._asdict().items()}
+    road = loop.plant.scene(loop.plan.plant, state.plant).road(row, AGENT)
     # The belief that the controller acted on is one step older than the road, and so is the leader's position that goes with it.
     leader, refused = road["position"] + road["gap"] - road["lead_speed"] * model.dt, False
     if frame is not None and frame.k[row] + 1 == state.k[row]:

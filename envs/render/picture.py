@@ -14,6 +14,7 @@ from tailgate.core import Array, Frame
 from tailgate.core.loop import Loop, LoopState
 from tailgate.core.registry import entry_for
 from tailgate.envs.render import following as render_following
+from tailgate.envs.render import lane as render_lane
 from tailgate.envs.render import network as render_network
 from tailgate.envs.render import platoon as render_platoon
 from tailgate.envs.render import radar as render_radar
@@ -25,9 +26,11 @@ AUTO = Viewer()
 
 
 def plain(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Array:
-    """Return (HEIGHT, WIDTH, 3) uint8: the road from the side, or the graph of a network. Arguments as of `draw`."""
+    """Return (HEIGHT, WIDTH, 3) uint8: the road from the side, a lane from above, or the graph of a network. Arguments as of `draw`."""
     if not loop.model.followers.any():
         return render_network.draw(loop, state, frame, row)
+    if loop.model.lane:
+        return render_lane.draw(loop, state, frame, row)
     if loop.model.agents > 1:
         return render_platoon.draw(loop, state, frame, row)
     if loop.model.air:

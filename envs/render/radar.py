@@ -39,7 +39,7 @@ def _sign(canvas: Canvas, muted: bool, energy: float, alarmed: bool) -> None:
 def draw(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Array:
     """Return (H, W, 3) uint8: row `row` after `frame`. frame is None right after a reset, also of other rows."""
     at = (row, AGENT)
-    road = {name: float(leaf[at]) for name, leaf in loop.plant.scene(loop.plan.plant, state.plant)._asdict().items()}
+    road = loop.plant.scene(loop.plan.plant, state.plant).road(row, AGENT)
     road["gap"], road["rear_gap"] = max(road["gap"], 0.0), max(road["rear_gap"], 0.0)  # a long step ends metres beyond a collision
     believed, canvas, scale = float(state.estimate.x[at][GAP]), Canvas(), scale_of(road["gap"], road["rear_gap"])
     fresh = frame is None or frame.k[row] + 1 != state.k[row]  # the prior is exact

@@ -117,8 +117,7 @@ def _string(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Stag
 
 def _pair(loop: Loop, state: LoopState, frame: Frame | None, row: int) -> Stage:
     """Return one car behind another, and perhaps a driver behind it."""
-    at = (row, 0)
-    road = {name: float(leaf[at]) for name, leaf in loop.plant.scene(loop.plan.plant, state.plant)._asdict().items()}
+    road = loop.plant.scene(loop.plan.plant, state.plant).road(row, 0)
     rear_hit = road["rear_gap"] <= 0.0
     hit = road["gap"] <= 0.0 or (bool(state.ended[row]) and not rear_hit)
     gap, rear_gap = max(road["gap"], 0.0), max(road["rear_gap"], 0.0)  # a step may end metres beyond a collision

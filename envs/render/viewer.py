@@ -44,11 +44,12 @@ class Viewer:
 
     def on_road(self, loop: Loop) -> bool:
         """Return if this loop is drawn on HighwayEnv's road. Raise ImportError or NotApplicable where it is asked for and cannot be."""
-        asked, drives = self.name == "highway" or self.size is not None, bool(loop.model.followers.any())
+        asked, drives = self.name == "highway" or self.size is not None, bool(loop.model.followers.any()) and not loop.model.lane
         if self.name == "plain" or not (drives or asked):
             return False
         if not drives:
-            raise NotApplicable("viewer", self.name if self.size is None else self.size, "cars on a road; 'plain' draws a network")
+            wanted = "cars that follow each other; 'plain' draws a network and a lane"
+            raise NotApplicable("viewer", self.name if self.size is None else self.size, wanted)
         if find_spec("highway_env") is None:
             if asked:
                 where = "pip install 'tailgate[highway,viz]' (viewer 'plain' does without)"

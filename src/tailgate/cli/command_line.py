@@ -20,7 +20,7 @@ from tailgate.base.interrupts import Ending, orderly
 EXIT_INPUT = 2
 COMMANDS = (
     "train", "tune", "selfplay", "ensemble", "distil", "evaluate", "timing", "dose", "transfer", "zoo", "calibrate", "leaderboard", "log",
-    "replay", "detect_log", "fit", "reproduce", "trust", "falsify", "rare", "bench", "list", "explain",
+    "replay", "detect_log", "fit", "reproduce", "cost", "trust", "falsify", "rare", "bench", "list", "explain",
 )  # fmt: skip
 
 

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from tailgate.base.errors import InputError
 from tailgate.base.files import aside
+from tailgate.cli.automata import add_automata, run_automata
+from tailgate.cli.prove import add_prove, run_prove
 from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, tell, values, working
 from tailgate.core.schema import scalar
 
@@ -48,6 +50,8 @@ def add(commands: Commands) -> None:
     add_options(command, "--workers", "--device", "--engine", "--address")
     command.add_argument("--out", metavar="DIR", help="write cells.jsonl, trust.json and the worst failing runs here; resumes")
     add_options(command, "--json")
+    add_prove(command)
+    add_automata(command)
     command.set_defaults(run=_trust)
 
 
@@ -92,6 +96,10 @@ def _trust(options: argparse.Namespace) -> int:
     from tailgate.trust.signals import SafeDistance
     from tailgate.trust.statistics import runs_for
 
+    if options.automata is not None:
+        return run_automata(options)
+    if options.prove:
+        return run_prove(options)
     own_classes()
     suite, rule = _suite(options), _rule(options)
     runs = runs_for(options.precision, options.confidence) if options.precision is not None else options.runs

@@ -22,6 +22,7 @@ from tailgate.core.nouns import (
     Estimate,
     Frame,
     Innovation,
+    Lane,
     Model,
     Prior,
     Received,
@@ -34,7 +35,7 @@ from tailgate.core.quantities import Count, Discount, Finite, NonNegative, Posit
 
 __all__ = [
     "AIRED", "Air", "Array", "Attack", "Command", "Controller", "Count", "Defence", "Discount", "Estimate", "Finite", "Frame",
-    "Innovation", "Kind", "Manoeuvre", "Mode", "Model", "NonNegative", "Paced", "Plant", "Positive", "PositiveCount", "Prior",
+    "Innovation", "Kind", "Lane", "Manoeuvre", "Mode", "Model", "NonNegative", "Paced", "Plant", "Positive", "PositiveCount", "Prior",
     "Probability", "Received", "Receiver", "Recording", "Scene", "Sensor", "Sized", "View", "WhiteBox",
     "no_command", "pair_of", "param",
 ]  # fmt: skip

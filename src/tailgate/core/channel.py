@@ -32,6 +32,7 @@ class ChannelPlan(NamedTuple):
     sensors: int
     air: bool
     recorded: int  # samples kept for delay and replay; 0 where neither is granted
+    sealed: Array  # (w,) bool: the wires whose values are authenticated
 
 
 class ChannelState(NamedTuple):
@@ -77,7 +78,8 @@ class Channel:
             kinds[Kind[name.upper()]] = True
         last = brief.horizon if threat.end is None else min(threat.end, brief.horizon)
         recorded = threat.memory if any(EFFECTS[kind].recorded for kind in np.flatnonzero(kinds).tolist()) else 0
-        return ChannelPlan(threat, brief.granted, kinds, brief.limits, last, len(brief.model.sensors), brief.model.air, recorded)
+        sensors = len(brief.model.sensors)
+        return ChannelPlan(threat, brief.granted, kinds, brief.limits, last, sensors, brief.model.air, recorded, brief.sealed)
 
     def start(self, plan: ChannelPlan, expected: Array, u: Array) -> ChannelState:
         """Return the memory at step 1; an early attack holds the expected links (B, N, q+p) and the first input u (B, N, m)."""
@@ -183,6 +185,8 @@ class Channel:
                     fits = effect.grants(plan.limits, value)
                     if effect.over_air:
                         fits = plan.air & (np.arange(value.shape[2]) < plan.sensors) & fits
+                    if plan.sealed.any() and not effect.over_air:  # a forged value is not accepted; an old one is until its key is known
+                        fits = fits & (~plan.sealed | (effect.recorded & (value <= plan.threat.key_interval)))
                     ok = ok & ((kind != one)[:, None, None] | fits)
         return np.asarray(legal & ~(command.target & ~ok).any(axis=(1, 2)))
 

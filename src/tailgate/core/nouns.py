@@ -50,6 +50,7 @@ class Model:
     Row i of `gap` and `speed` (N, n) says how agent i's gap to the vehicle ahead and its own speed depend on x; a row of zeros, the
     default, is an agent without a road. `challenge` is the number of complex samples that a sensor which listens to its own echo takes
     while its probe is muted; 0, the default, is a sensor that does not: noise_jam and echo_delay reach only those that do (`air`).
+    `lane` is half of the width of a lane [m] whose nearer line takes the place of the car ahead; 0, the default, is a road with cars.
     """
 
     A: Array
@@ -66,6 +67,7 @@ class Model:
     gap: Array | None = None
     speed: Array | None = None
     challenge: int = 0
+    lane: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("A", "B", "c", "C", "Q", "R", "graph", "gap", "speed"):  # public, and nobody's to change: own copies, read-only
@@ -100,7 +102,7 @@ class Model:
 
     @property
     def followers(self) -> Array:
-        """(N,) bool: the agents that drive behind another vehicle."""
+        """(N,) bool: the agents that drive behind another vehicle, or between the lines of a lane."""
         assert self.gap is not None
         return np.asarray((self.gap != 0.0).any(axis=1))
 
@@ -139,8 +141,19 @@ class Prior(NamedTuple):
     cov: Array
 
 
+class Lane(NamedTuple):
+    """The place of a car in its lane, each (B, N); left is positive."""
+
+    offset: Array  # of the centre of gravity from the middle [m]
+    rate: Array  # of that offset [m/s]
+    curvature: Array  # of the road [1/m]
+
+
 class Scene(NamedTuple):
-    """The road as anyone near it sees it, each (B, N). Gap [m] to the car ahead, bumper to bumper; speeds [m/s]."""
+    """The road as anyone near it sees it, each (B, N). Gap [m] to the car ahead, bumper to bumper; speeds [m/s].
+
+    Where a plant has a `lane`, its nearer line takes the place of the car ahead.
+    """
 
     gap: Array  # inf where nobody drives ahead
     speed: Array
@@ -149,6 +162,12 @@ class Scene(NamedTuple):
     rear_gap: Array  # to a car behind that is not an agent; inf where there is none
     rear_speed: Array
     position: Array
+    lane: Lane | None = None
+
+    def road(self, row: int, agent: int) -> dict[str, float]:
+        """Return the numbers of one agent in one row, by name; those of a lane apart."""
+        leaves: dict[str, Array] = {name: leaf for name, leaf in self._asdict().items() if name != "lane"}
+        return {name: float(leaf[row, agent]) for name, leaf in leaves.items()}
 
 
 class Received(NamedTuple):

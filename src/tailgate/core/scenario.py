@@ -58,6 +58,9 @@ class Scenario:
         if isinstance(self.manoeuvre, Recording) and not isinstance(self.plant, Paced):
             wanted = "one whose cars may begin at any speed, as acc_string"
             raise InputError(f"scenario {self.name}: plant", type(self.plant).__name__, wanted)
+        if getattr(self.manoeuvre, "curved", False) != (loop.model.lane > 0.0):
+            wanted = "curves or bend: the plant keeps a lane" if loop.model.lane else "one that drives the leader: the plant keeps no lane"
+            raise InputError(f"scenario {self.name}: manoeuvre", type(self.manoeuvre).__name__, wanted)
         if not loop.link.perfect and loop.model.air:
             raise InputError(where, self.truth, "no loss or latency: a radar is read where it hears")
         if told is not None and told.C.shape != plant.model(sensor, self.controller).C.shape:

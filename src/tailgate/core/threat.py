@@ -42,6 +42,9 @@ class ThreatModel:
     sees_measurement: bool = param(False, "grants the measurement that the defence receives; of a radar it shows which step is muted")
     hold_from_onset: bool = param(False, "dos_hold keeps the last good sample before onset (6.18), not before the first hit", if_any=True)
 
+    authenticated: tuple[str, ...] = param((), "wires whose values carry a tag: they may be held or lost, not forged", if_any=True)
+    key_interval: Count = param(0, "age up to which an authenticated value is accepted again, until its key is known [steps]", if_any=True)
+
     def __post_init__(self) -> None:
         check_order("threat_model.jam_range", self.jam_range)
         if self.end is not None and self.end < self.onset:
@@ -68,6 +71,15 @@ class Brief:
                 raise InputError("threat_model.agents", i, f"an agent's number, from 0 to {agents - 1}")
         names, some = self.threat.targets or self.model.sensors, self.threat.agents or range(agents)
         return np.asarray(np.isin(np.arange(agents), list(some))[:, None] & np.array([w in names for w in wires]))
+
+    @property
+    def sealed(self) -> Array:
+        """(w,) bool: the wires whose values are authenticated."""
+        wires = self.model.wires
+        for name in self.threat.authenticated:
+            if name not in wires:
+                raise unknown("threat_model.authenticated", name, wires)
+        return np.array([name in self.threat.authenticated for name in wires], bool)
 
     @property
     def is_actuator(self) -> Array:

@@ -2,6 +2,7 @@
 
 Their docstrings describe the quantity to readers of boards.
 Among several agents, a metric of the road covers those that follow another vehicle; it is undefined without any.
+In a lane the nearer line takes the place of the car ahead, and the closing speed is lateral. Metrics of braking are undefined there.
 An estimate's error is that of the gap, or the norm of the whole state's error if there is no road (`Model.error`).
 """
 
@@ -57,6 +58,11 @@ def _pooled(x: Array, where: Array) -> Array:
     if not x.shape[2]:
         return np.full(x.shape[1], np.nan)
     return _mean(np.concatenate(np.moveaxis(x, 2, 0)), np.concatenate([where] * x.shape[2]))
+
+
+def _cars(trace: Trace) -> bool:
+    """Return if cars follow each other, so that they brake."""
+    return bool(trace.model.followers.any()) and not trace.model.lane
 
 
 def _road(trace: Trace, name: str) -> Array:
@@ -174,7 +180,7 @@ def recovery_time(trace: Trace) -> Array:
     error = np.abs(_road(trace, "gap") - trace.desired_gap(_road(trace, "speed")))
     restless = np.max(np.where((error > RECOVERY_TOLERANCE).any(axis=2) & trace.live, steps, -1), axis=0)
     calm_from = np.maximum(restless, last) + 1
-    recovered = (last >= 0) & (calm_from < trace.length) & (crashed(trace) == 0.0) & trace.model.followers.any()
+    recovered = (last >= 0) & (calm_from < trace.length) & (crashed(trace) == 0.0) & _cars(trace)
     return np.where(recovered, (calm_from - last) * trace.dt, np.nan)
 
 
@@ -227,7 +233,7 @@ def distance_travelled(trace: Trace) -> Array:
 def max_decel(trace: Trace) -> Array:
     """Hardest braking of any car that follows another."""
     hardest = np.max(np.where(trace.live[:, :, None], -_road(trace, "accel"), 0.0), axis=(0, 2), initial=0.0)
-    return np.where(trace.model.followers.any(), hardest, np.nan)
+    return np.where(_cars(trace), hardest, np.nan)
 
 
 @metric("m/s^3")
@@ -241,7 +247,7 @@ def rms_jerk(trace: Trace) -> Array:
 @metric("ratio")
 def string_gain(trace: Trace) -> Array:
     """Root mean square acceleration of the last car over that of the car ahead of the first; null where that keeps its speed."""
-    if not trace.model.followers.any():
+    if not _cars(trace):
         return np.full(trace.batch, np.nan)
     speed = np.concatenate([_before(trace, "lead_speed")[None], _road(trace, "lead_speed")])[:, :, 0]
     lead = _rms((speed[1:] - speed[:-1]) / trace.dt, trace.live)

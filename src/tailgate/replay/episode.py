@@ -73,6 +73,8 @@ def _believed_gap(replay: Replay, agent: int) -> Array:
     """
     trace, model = replay.trace, replay.loop.model
     assert model.gap is not None
+    if model.lane:
+        return np.asarray(model.lane - np.abs(trace.estimate[:, 0, agent] @ model.gap[agent]))
     if model.agents > 1 or model.air:
         return np.asarray(trace.estimate[:, 0, agent] @ model.gap[agent])
     if "leader_position" in model.v2v:
@@ -158,6 +160,22 @@ def _of_agent(replay: Replay, agent: int) -> Data:
     return out
 
 
+def _in_lane(replay: Replay) -> Data:
+    """Return the curves of the picture of a lane: K + 1 places and headings of the car, and K errors of the belief."""
+    trace, half = replay.trace, replay.loop.model.lane
+    truth, off = trace.truth[:, 0, 0], trace.estimate[:, 0, 0] - trace.truth[:, 0, 0]
+    gap = _road(replay, "gap", 0)
+    last = np.copysign(half - gap[-1], truth[-1, 0])  # a trace holds the state up to the last measurement
+    speed = _road(replay, "speed", 0)
+    turn = np.concatenate([truth[:, 3], truth[-1:, 3]])
+    bend = (_road(replay, "accel", 0) / speed - turn) / speed  # the lateral acceleration is v (e_psi' + v kappa)
+    bend[-1] = bend[-2] if len(bend) > 1 else bend[-1]
+    return {
+        "half": half, "offset": curve(np.append(truth[:, 0], last)), "heading": curve(np.append(truth[:, 2], truth[-1, 2])),
+        "curvature": curve(bend), "believed": curve(off[:, 0]), "turned": curve(off[:, 2]),
+    }  # fmt: skip
+
+
 def _radar(replay: Replay, agent: int) -> Data:
     """Return the radar's curves: muted (K,), energy over its noise [dB], and the defence's threshold [dB] if it has one.
 
@@ -189,6 +207,8 @@ def _errors(replay: Replay, agent: int) -> list[Data]:
     if model.agents == 1 and model.followers.any():
         off = trace.estimate[:, 0, 0] - trace.truth[:, 0, 0]
         parts = [("position", "position", "m", 1.0), ("velocity", "velocity", "m/s", 0.5)]
+        if model.lane:
+            parts, off = [("offset-error", "offset", "m", 0.2), ("heading-error", "heading", "rad", 0.02)], off[:, ::2]
         if model.air:
             parts = [("gap-error", "gap", "m", 1.0), ("relative-speed-error", "relative speed", "m/s", 0.5)]
         return [
@@ -250,6 +270,6 @@ def episode_of(replay: Replay, agent: int | None = None) -> Data:
     }  # fmt: skip
     chosen = watched(replay, agent)
     if model.agents == 1:
-        return out | _of_agent(replay, 0)
+        return out | _of_agent(replay, 0) | ({"lane": _in_lane(replay)} if model.lane else {})
     agents = shown(replay, chosen)
     return out | _everybody(replay, agents) | {"agent": chosen, "agents": {i: _of_agent(replay, i) for i in agents}}

@@ -11,7 +11,7 @@
     show(s);
   };
   // one agent: all plots. Several: plots of all, and plots of the selected one
-  const many = Boolean(episode.agents), drawScene = episode.graph ? drawGraph : many ? drawString : drawRoad;
+  const many = Boolean(episode.agents), drawScene = episode.graph ? drawGraph : episode.lane ? drawLane : many ? drawString : drawRoad;
   const together = many ? buildPlots(at("together"), episode, seek, "all") : null;
   let agent = many ? episode.agent : 0, plots = null;
   const choose = (number) => {
@@ -124,8 +124,8 @@
   if (alarms.length) places.push(["First alarm", alarms[0][0]]);
   const course = [...Array(length + 1).keys()].map((s) => [worst(s), s]).filter(([value]) => value !== null);
   const way = episode.graph ? -1 : 1, [, extreme] = course.reduce((best, one) => (way * one[0] < way * best[0] ? one : best));
-  places.push([episode.graph ? "Largest error" : "Smallest gap", extreme]);
-  if (episode.hit !== null) places.push(["Collision", episode.hit]);
+  places.push([episode.graph ? "Largest error" : episode.lane ? "Nearest to a line" : "Smallest gap", extreme]);
+  if (episode.hit !== null) places.push([episode.lane ? "Off the lane" : "Collision", episode.hit]);
   if (episode.rear_hit !== null) places.push(["Rear collision", episode.rear_hit]);
   if (length !== episode.hit && length !== episode.rear_hit) places.push(["End", length]);
   for (const [name, s] of places) {

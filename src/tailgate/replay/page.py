@@ -38,6 +38,12 @@ def outcome(replay: Replay) -> str:
         last, agent = divmod(int(np.argmax(size)), model.agents)
         when = f"at t = {(last + 1) * trace.dt:.4g} s (step {last + 1})"
         return f"The largest error of an estimate was {size.max():.4g}, of agent {agent} {when}"
+    if model.lane:
+        left = first_step(trace.collided[:, 0])
+        if left is not None:
+            return f"The car left its lane at t = {left * trace.dt:.4g} s (step {left}), at {metrics['impact_speed']:.3g} m/s across"
+        gap = metrics["min_gap"]
+        return "The car kept its lane" + ("" if gap is None else f"; it came as near as {gap:.3g} m to a line")
     ahead, behind = "the car hit the one ahead", "the car behind hit the car"
     if model.agents > 1 and (step := first_step(trace.collided[:, 0])) is not None:
         car = int(np.argmin(trace.gap[step - 1, 0]))
@@ -94,6 +100,7 @@ def _file_name(path: str) -> str:
 
 PICTURES = {  # captions of the canvas
     "road": "The road as it is, and where the car believes that it is",
+    "lane": "The lane from above: the car, and as an outline where it believes that it is",
     "string": "The road as it is, and where each car believes that it is",
     "graph": "The graph of the agents, shaded by their errors",
 }  # fmt: skip
@@ -102,7 +109,7 @@ PICTURES = {  # captions of the canvas
 def context_of(replay: Replay, source: str) -> Data:
     """Return the words and tables of the template. `source` says where the row comes from."""
     model = replay.loop.model
-    picture = "graph" if not model.followers.any() else "string" if model.agents > 1 else "road"
+    picture = "graph" if not model.followers.any() else "lane" if model.lane else "string" if model.agents > 1 else "road"
     row, place = replay.row, replay.place
     tone, title, why = VERDICTS[replay.verdict]
     tone_of = "plain" if picture == "graph" else "bad" if replay.metrics["crashed"] else "good"
@@ -143,7 +150,7 @@ def render(replay: Replay, source: str = "", agent: int | None = None) -> str:
     """Return the page as text; `agent` is the agent to show first."""
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     here = "tailgate.replay"
-    css, js = inline(here, "page.css"), inline(here, "pen.js", "road.js", "string.js", "graph.js", "plots.js", "page.js")
+    css, js = inline(here, "page.css"), inline(here, "pen.js", "road.js", "lane.js", "string.js", "graph.js", "plots.js", "page.js")
     data = embedded(episode_of(replay, agent))
     return environment.from_string(asset(here, "page.html")).render(css=css, js=js, data=data, **context_of(replay, source))
 

@@ -197,7 +197,7 @@ const buildPlots = (() => {
     };
 
     const collisions = (self, frame) => hits.forEach((step) => {
-      const at = frame.x(step * dt), before = at - frame.left > 100, words = step === episode.hit ? "collision" : "rear collision";
+      const at = frame.x(step * dt), before = at - frame.left > 100, words = step === episode.hit ? (episode.lane ? "off the lane" : "collision") : "rear collision";
       make("text", { class: "mark", x: at + (before ? -5 : 5), y: TOP + 10, "text-anchor": before ? "end" : "start" }, self.svg, words);
     });
     if (part === "all") {
@@ -217,15 +217,15 @@ const buildPlots = (() => {
         if (Math.min(...Object.values(episode.sizes).flat()) < bottom) note(one, `below ${short(bottom)}: drawn at the lower edge`);
       }
     }
-    if (part !== "all" && road) chart("gap", "Gap to the car ahead", "m", [
+    if (part !== "all" && road) chart("gap", episode.lane ? "Distance to the nearer line" : "Gap to the car ahead", "m", [
       { name: "true", values: road.gap, offset: 0, ink: TRUTH, thick: 2.5 },
       { name: `believed${of}`, values: believed.gap, offset: age, ink: BELIEF, dash: "6 4", wild: true },
-      { name: "desired at the true speed", values: episode.desired, offset: 0, ink: DESIRED, dash: "2 3" },
+      { name: episode.lane ? "in the middle" : "desired at the true speed", values: episode.desired, offset: 0, ink: DESIRED, dash: "2 3" },
     ], {
-      include: [0], least: 5, height: 190,
+      include: [0], least: episode.lane ? 1 : 5, height: 190,
       over: collisions,
     });
-    if (part !== "all" && road) chart("speed", "Speed", "m/s", [
+    if (part !== "all" && road && !episode.lane) chart("speed", "Speed", "m/s", [
       { name: part ? `car ${episode.number}` : "ego", values: road.speed, offset: 0, ink: EGO, thick: 2.5, digits: 2 },
       { name: "ahead", values: road.lead_speed, offset: 0, ink: LEADER, dash: "10 3 2 3", digits: 2 },
       { name: `believed own${of}`, values: believed.speed, offset: age, ink: BELIEF, dash: "6 4", wild: true, digits: 2 },
@@ -286,7 +286,7 @@ const buildPlots = (() => {
     if (episode.control && part !== "all") {
       const commands = [{ name: "commanded", values: episode.control, offset: 1, ink: TRUTH, digits: 2 }];
       if (episode.applied) commands.push({ name: "applied (attacked)", values: episode.applied, offset: 1, ink: ATTACK, dash: "6 4", digits: 2 });
-      const control = chart("control", "Commanded acceleration", "m/s²", commands, { include: [0], least: 1, height: 130 });
+      const control = chart("control", ...(episode.lane ? ["Commanded steering angle", "rad"] : ["Commanded acceleration", "m/s²"]), commands, { include: [0], least: episode.lane ? 0.01 : 1, height: 130 });
       if (!episode.applied) note(control, "applied as commanded throughout");
     }
 

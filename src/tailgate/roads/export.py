@@ -52,6 +52,8 @@ def _road(trace: Trace, name: str, row: int) -> Array:
 def cars_of(trace: Trace, row: int = 0) -> Cars:
     """Return the road of an episode. Raise InputError for a system without one."""
     model = trace.model
+    if model.lane:
+        raise InputError("--export", "a car in a lane", "an episode of cars that follow each other; tailgate log writes the others")
     if not model.followers.any():
         raise InputError("--export", "a system without a road", "an episode of cars; tailgate log writes the others")
     x, v, a, gap, ahead = (_road(trace, name, row) for name in ("position", "speed", "accel", "gap", "lead_speed"))

@@ -177,6 +177,8 @@ def load_network(name: str) -> Network:
 def network_of(data: dict[str, Any]) -> Network:
     """Return a network from data as the YAML file has it, checked as a whole."""
     where = f"automata {data.get('name', '')}".strip()
+    if "kind" in data:
+        raise InputError(f"{where}.kind", data["kind"], "no kind: this is read as timed automata; tailgate trust --automata reads ctmc")
     components = tuple(_component(held, f"{where}: component {i}") for i, held in enumerate(_list(data, "components", where), start=1))
     queries = tuple(build(Query, held, f"{where}: query {i}") for i, held in enumerate(_list(data, "queries", where), start=1))
     network = build(Network, data | {"components": components, "queries": queries}, where)

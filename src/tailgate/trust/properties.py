@@ -85,6 +85,8 @@ def _no_collision(model: Model) -> Property:
 def _brakes(model: Model, horizon: int, asked: Demands) -> Property:
     about = f"brakes within {1000 * asked.deadline:g} ms, and on, whenever it is too close to stop after an attack began"
     last = (horizon - 1) * model.dt - asked.deadline - asked.hold
+    if model.lane:
+        return _none("brakes", about, "a car that keeps its lane at constant speed does not brake")
     if not model.followers.any():
         return _none("brakes", about, "nobody drives behind another")
     if model.dt * asked.steps > asked.deadline * (1.0 + 1e-9):

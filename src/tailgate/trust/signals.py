@@ -122,6 +122,8 @@ def check_names(names: Iterable[str], model: Model) -> None:
             raise unknown("signal", head, SIGNALS)
         if SIGNALS[head].road and not model.followers.any():
             raise NotApplicable("signal", head, "a scenario in which somebody follows another")
+        if head in ("margin", "safe", "lead_speed") and model.lane:
+            raise NotApplicable("signal", head, "a scenario in which cars follow each other: a lane has no safe distance")
         if number and not (int(number) < model.agents and (not SIGNALS[head].road or model.followers[int(number)])):
             who = np.flatnonzero(model.followers) if SIGNALS[head].road else range(model.agents)
             raise NotApplicable("signal", name, f"one of the agents {', '.join(str(i) for i in who)}")

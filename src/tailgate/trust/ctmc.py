@@ -1,0 +1,312 @@
+"""The security of an architecture as a continuous-time Markov chain: nodes that are exploited through their neighbours, and patched.
+
+A node is secure or exploited. An exploit takes an exponential time, and needs an entry from outside or an exploited neighbour. A patch
+takes an exponential time, and makes the node secure again. A message is broken while any node that it passes through is exploited
+(Mundhenk et al., Security Analysis of Automotive Architectures Using Probabilistic Model Checking, DAC 2015).
+
+Up to 10^5 states the chain is solved by uniformisation. A larger one is played as a network of automata (`as_network`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+from tailgate.base.errors import InputError, NotApplicable, unknown
+from tailgate.core import Array, NonNegative, Positive, param
+from tailgate.core.scenario import config_path
+from tailgate.core.schema import build, read_yaml
+from tailgate.trust.automata import NAME, Atom, Component, Edge, Location, Network, Query, check
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+FORMAT = "tailgate-ctmc-1"
+MOST = 100_000  # states that are solved
+TAIL = 1e-12  # probability of the Poisson terms that are left out
+STILL = 1e-13  # change of a distribution over a step that counts as none
+LONGEST = 2_000_000  # steps of the uniformised chain
+Pair = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class Node:
+    """A control unit, a bus or a radio."""
+
+    name: str
+    exploit: NonNegative = param(1.0, "rate at which it is exploited while it can be reached [1/unit]")
+    patch: NonNegative = param(0.0, "rate at which an exploited one becomes secure again [1/unit]")
+    entry: bool = param(False, "it can be reached from outside")
+
+
+@dataclass(frozen=True)
+class Route:
+    """A message and the nodes that it passes through."""
+
+    name: str
+    through: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A question: the probability that a message was broken by some time, if all is secure at first."""
+
+    name: str
+    message: str
+    within: Positive
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """Nodes, the links between them, messages, and what is asked of them."""
+
+    name: str
+    nodes: tuple[Node, ...]
+    links: tuple[Pair, ...] = ()
+    messages: tuple[Route, ...] = ()
+    queries: tuple[Asked, ...] = ()
+    kind: Literal["ctmc"] = "ctmc"
+    unit: str = param("year", "unit of time")
+    about: str = ""
+
+    def neighbours(self, name: str) -> tuple[str, ...]:
+        """Return the nodes that a node is linked with."""
+        return tuple(b if a == name else a for a, b in self.links if name in (a, b))
+
+    def message(self, name: str) -> Route:
+        """Raise InputError for a name that does not exist."""
+        for one in self.messages:
+            if one.name == name:
+                return one
+        raise unknown(f"automata {self.name}: message", name, [one.name for one in self.messages])
+
+
+def load_architecture(name: str) -> Architecture:
+    """Return an architecture by its built-in name, or from a YAML file with `kind: ctmc`."""
+    path = config_path("automata", name, "automata")
+    return architecture_of({"name": path.stem} | read_yaml(path, "automata"))
+
+
+def architecture_of(data: dict[str, Any]) -> Architecture:
+    """Return an architecture from data as the YAML file has it, checked as a whole."""
+    where = f"automata {data.get('name', '')}".strip()
+    if data.get("kind") != "ctmc":
+        raise InputError(f"{where}.kind", data.get("kind"), "ctmc; a network of timed automata has no kind, and is simulated")
+    for key, one, cls in (("nodes", "node", Node), ("messages", "message", Route), ("queries", "query", Asked)):
+        held = data.get(key, [])
+        if not isinstance(held, list) or not all(isinstance(part, dict) for part in held):
+            raise InputError(f"{where}.{key}", held, "a list of mappings")
+        data = data | {key: tuple(build(cls, part, f"{where}: {one} {i}") for i, part in enumerate(held, start=1))}
+    made: Architecture = build(Architecture, data, where)
+    _check(made, where)
+    return made
+
+
+def _check(made: Architecture, where: str) -> None:
+    if not made.nodes:
+        raise InputError(f"{where}.nodes", [], "at least one node")
+    parts: dict[str, tuple[Node | Route | Asked, ...]] = {"nodes": made.nodes, "messages": made.messages, "queries": made.queries}
+    for key, held in parts.items():
+        names = [part.name for part in held]
+        for i, name in enumerate(names):
+            if name in names[:i]:
+                raise InputError(f"{where}.{key}", name, "names of which no two are equal")
+            if not NAME.match(name):
+                raise InputError(f"{where}.{key}", name, "a letter, then letters, digits and underscores")
+    known = [node.name for node in made.nodes]
+    for pair in made.links:
+        for name in pair:
+            if name not in known:
+                raise unknown(f"{where}.links", name, known)
+        if pair[0] == pair[1]:
+            raise InputError(f"{where}.links", list(pair), "two different nodes")
+    if not any(node.entry for node in made.nodes):
+        raise InputError(f"{where}.nodes", known, "at least one entry from outside")
+    for route in made.messages:
+        if not route.through:
+            raise InputError(f"{where}: message {route.name}.through", [], "at least one node")
+        for name in route.through:
+            if name not in known:
+                raise unknown(f"{where}: message {route.name}.through", name, known)
+    for query in made.queries:
+        made.message(query.message)
+
+
+class Chain(NamedTuple):
+    """The reachable states, the secure one first: exploited (S, n) bool, and the generator Q (S, S)."""
+
+    exploited: Array
+    generator: csr_matrix
+
+
+def chain_of(made: Architecture, most: int = MOST) -> Chain:
+    """Return the chain of all states that can be reached from the secure one.
+
+    Raises
+    ------
+    NotApplicable
+        If there are more than `most`.
+    """
+    from scipy.sparse import csr_matrix
+
+    names = [node.name for node in made.nodes]
+    near = [sum(1 << names.index(other) for other in set(made.neighbours(name))) for name in names]
+    place, order, rows, columns, rates = {0: 0}, [0], [], [], []
+    for state in order:  # grows while it is read
+        for i, node in enumerate(made.nodes):
+            on = state >> i & 1
+            rate = node.patch if on else node.exploit if node.entry or state & near[i] else 0.0
+            if rate == 0.0:
+                continue
+            after = state ^ 1 << i
+            if after not in place:
+                if len(order) >= most:
+                    raise NotApplicable(f"automata {made.name}", f"more than {most} states", "fewer nodes, or --runs to simulate")
+                place[after] = len(order)
+                order.append(after)
+            rows.append(place[state])
+            columns.append(place[after])
+            rates.append(rate)
+    size = len(order)
+    off = csr_matrix((rates, (rows, columns)), shape=(size, size))
+    out = np.asarray(off.sum(axis=1)).ravel()
+    diagonal = csr_matrix((out, (np.arange(size), np.arange(size))), shape=(size, size))
+    states = np.array([[state >> i & 1 for i in range(len(names))] for state in order], bool).reshape(size, len(names))
+    return Chain(states, (off - diagonal).tocsr())
+
+
+def broken(made: Architecture, chain: Chain, message: str) -> Array:
+    """Return (S,) bool: the states in which a message is broken."""
+    names = [node.name for node in made.nodes]
+    return np.asarray(chain.exploited[:, [names.index(name) for name in made.message(message).through]].any(axis=1))
+
+
+def transient(generator: csr_matrix, start: Array, time: float) -> Array:
+    """Return the distribution (S,) at a time, by uniformisation: Poisson's weights of the steps of the uniformised chain.
+
+    The terms that are left out have the probability TAIL together.
+    """
+    from scipy.stats import poisson
+
+    fastest = float(-generator.diagonal().min(initial=0.0))
+    if fastest == 0.0 or time == 0.0:
+        return np.array(start, float)
+    mean = fastest * time
+    last = int(poisson.isf(TAIL / 2.0, mean)) + 1
+    if last > LONGEST:
+        raise NotApplicable("automata: within", time, f"a time of at most {LONGEST / fastest:.3g}: the fastest rate is {fastest:g}")
+    first = max(int(poisson.ppf(TAIL / 2.0, mean)) - 1, 0)
+    weights, step = poisson.pmf(np.arange(last + 1), mean), generator.T.tocsr() / fastest
+    held, out = np.array(start, float), np.zeros(len(start))
+    for k in range(last + 1):
+        if k >= first:
+            out += weights[k] * held
+        held = held + step @ held
+    return np.asarray(out)
+
+
+def first_time(made: Architecture, chain: Chain, message: str, within: float) -> float:
+    """Return the probability that a message was broken by a time, from the secure state: the broken states absorb."""
+    hit = broken(made, chain, message)
+    keep = (~hit).astype(float)
+    generator = chain.generator.multiply(keep[:, None]).tocsr()
+    start = np.zeros(len(hit))
+    start[0] = 1.0
+    return float(transient(generator, start, within)[hit].sum())
+
+
+def lasting(chain: Chain) -> Array:
+    """Return the distribution (S,) in the long run, from the secure state, by the powers of the uniformised chain.
+
+    Raises
+    ------
+    NotApplicable
+        If it does not settle.
+    """
+    fastest = float(-chain.generator.diagonal().min(initial=0.0))
+    held = np.zeros(len(chain.exploited))
+    held[0] = 1.0
+    if fastest == 0.0:
+        return held
+    step = chain.generator.T.tocsr() / (1.05 * fastest)  # a little slower than the fastest: no state is left for sure, so it has no period
+    for _ in range(LONGEST):
+        change = step @ held
+        held = held + change
+        if np.abs(change).sum() < STILL:
+            return np.asarray(np.maximum(held, 0.0) / np.maximum(held, 0.0).sum())
+    raise NotApplicable("automata", f"{LONGEST} steps", "a chain that settles")
+
+
+def long_run(made: Architecture, chain: Chain, message: str, share: Array | None = None) -> float:
+    """Return the share of time that a message is broken, in the long run."""
+    held = lasting(chain) if share is None else share
+    return float(held[broken(made, chain, message)].sum())
+
+
+def as_network(made: Architecture) -> Network:
+    """Return the same process as a network of automata with exponential delays, for as many nodes as anyone likes.
+
+    `x_NODE` is 1 while a node is exploited, `hit_MESSAGE` from the first time on that the message was broken.
+    """
+    components = []
+    for node in made.nodes:
+        hits = {f"hit_{route.name}": 1.0 for route in made.messages if node.name in route.through}
+        guards: list[tuple[Atom, ...]] = [()] if node.entry else [(Atom(f"x_{other}", "=", 1.0),) for other in made.neighbours(node.name)]
+        edges = [Edge(f"secure_{node.name}", f"exploited_{node.name}", guard, assign={f"x_{node.name}": 1.0} | hits) for guard in guards]
+        if node.exploit == 0.0:
+            edges = []
+        if node.patch > 0.0:
+            edges.append(Edge(f"exploited_{node.name}", f"secure_{node.name}", assign={f"x_{node.name}": 0.0}))
+        places = (
+            Location(f"secure_{node.name}", rate=node.exploit or 1.0), Location(f"exploited_{node.name}", rate=node.patch or 1.0),
+        )  # fmt: skip
+        components.append(Component(node.name, f"secure_{node.name}", places, tuple(edges), variables={f"x_{node.name}": 0}))
+    first = components[0]
+    hit = {f"hit_{route.name}": 0 for route in made.messages}
+    components[0] = Component(first.name, first.initial, first.locations, first.edges, variables=first.variables | hit)
+    queries = tuple(Query(query.name, query.within, (Atom(f"hit_{query.message}", "=", 1.0),)) for query in made.queries)
+    network = Network(made.name, tuple(components), queries)
+    check(network)
+    return network
+
+
+def solve(made: Architecture) -> dict[str, Any]:
+    """Return the report: of each message its share of time broken in the long run, of each query its probability."""
+    chain = chain_of(made)
+    share = lasting(chain)
+    return {
+        "format": FORMAT, "name": made.name, "unit": made.unit, "method": "uniformisation", "states": len(share),
+        "nodes": {node.name: float(share[chain.exploited[:, i]].sum()) for i, node in enumerate(made.nodes)},
+        "messages": {route.name: long_run(made, chain, route.name, share) for route in made.messages},
+        "queries": [
+            {"name": q.name, "message": q.message, "within": q.within, "probability": first_time(made, chain, q.message, q.within)}
+            for q in made.queries
+        ],
+    }  # fmt: skip
+
+
+def play(made: Architecture, runs: int, level: float = 0.95) -> dict[str, Any]:
+    """Return the report of a simulation: each query's share of runs with its exact interval.
+
+    Raises
+    ------
+    InputError
+        Without a query, or with fewer than one run.
+    """
+    from tailgate.evaluation.stats import proportion
+    from tailgate.trust.simulate import simulate
+
+    if runs < 1:
+        raise InputError("--runs", runs, "a whole number, at least 1")
+    if not made.queries:
+        raise InputError(f"automata {made.name}.queries", [], "at least one query to simulate")
+    found = simulate(as_network(made), range(runs))
+    rows = []
+    for query, times in zip(made.queries, found.hit, strict=True):
+        share = proportion(int(np.count_nonzero(np.nan_to_num(times, nan=math.inf) <= query.within)), runs, level)
+        one = {"name": query.name, "message": query.message, "within": query.within}
+        rows.append(one | {"probability": share.value, "low": share.low, "high": share.high})
+    return {"format": FORMAT, "name": made.name, "unit": made.unit, "method": "simulation", "runs": runs, "queries": rows}
