@@ -90,6 +90,6 @@ class L1Decoder(Relaxed):
 
     def decode(self, plan: DecoderPlan, own: None, held: Centred) -> tuple[None, Decoded]:
         O, units = plan.window.O, plan.own[..., None]
-        x = decoded(grouped(O * units[..., None], held.Y * units, held.there, self.norm), self.rounds)
+        x = decoded(grouped(O * units[..., None], held.Y * units, held.there, self.norm), int(self.rounds))
         score = np.max(np.where(held.there, np.abs(held.Y - modelled(O, x)), 0.0), axis=(-2, -1))
         return None, Decoded(x, score, score > self.threshold)

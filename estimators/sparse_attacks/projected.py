@@ -180,7 +180,7 @@ class ProjectedGradient(Relaxed):
             newest = np.where(largest(own.E, self.s)[..., None], (scaled.Y - modelled(p.O, x))[..., -1:], 0.0)
             E = np.concatenate([moved[..., :-1], newest], axis=-1)
         alarm = score > p.threshold
-        found = solved(p, scaled, x, E, self.s, self.nu, self.rounds)
+        found = solved(p, scaled, x, E, self.s, self.nu, int(self.rounds))
         support = alarm[..., None] & (num.dot(found.E, found.E) > 0.0)
         x = least_squares(O, held.Y, gram, np.where(support, 0.0, 1.0), floor)
         if own is not None:
