@@ -41,7 +41,8 @@ class BernoulliState(NamedTuple):
 
 @register(
     "defence", "bernoulli",
-    reference="N. Forti, G. Battistelli, L. Chisci, B. Sinopoli, A Bayesian Approach to Joint Attack Detection and Resilient State Estimation, 2016",
+    reference="N. Forti, G. Battistelli, L. Chisci, B. Sinopoli, A Bayesian Approach to Joint Attack Detection and Resilient State "
+    "Estimation, 2016",
 )  # fmt: skip
 @dataclass(frozen=True)
 class Bernoulli:
@@ -53,7 +54,9 @@ class Bernoulli:
     spread: Positive = param(62.0, "standard deviation of what a new attack adds; that of a uniform value in +-108 [unit of the sensor]")
     drift: NonNegative = param(1.0, "standard deviation of its change in a step [unit of the sensor]")
     attacked: tuple[str, ...] = param((), "sensors that an attack may add to; empty: all")
-    estimate: Literal["likelier", "mean"] = param("likelier", "likelier: the mean with an attack where r > 1/2, else without; mean: both, weighed by r")
+    estimate: Literal["likelier", "mean"] = param(
+        "likelier", "likelier: the mean with an attack where r > 1/2, else without; mean: both, weighed by r"
+    )
     threshold: Finite = param(0.0, "alarm above these log odds of an attack; 0: probability 1/2 [-]")
 
     def prepare(self, model: Model) -> BernoulliPlan:

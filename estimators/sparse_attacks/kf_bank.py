@@ -23,7 +23,10 @@ from tailgate.estimators.parts import Verdict, blame_all
 from tailgate.estimators.sparse_attacks.bank import BankPlan, bank_plan, bank_start, bank_step, statistic
 from tailgate.estimators.sparse_attacks.subsets import require, without
 
-PAPER = "S. Mishra, Y. Shoukry, N. Karamchandani, S. Diggavi, P. Tabuada, Secure State Estimation Against Sensor Attacks in the Presence of Noise, 2017"
+PAPER = (
+    "S. Mishra, Y. Shoukry, N. Karamchandani, S. Diggavi, P. Tabuada, Secure State Estimation Against Sensor Attacks in the Presence of "
+    "Noise, 2017"
+)
 Tail = Annotated[float, Field(gt=0, lt=1)]
 ATTACKED = "sensors that may be attacked at the same time"
 

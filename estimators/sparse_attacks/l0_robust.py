@@ -20,7 +20,17 @@ from tailgate import num
 from tailgate.base.errors import InputError
 from tailgate.core import Array, Model, Positive, param
 from tailgate.core.registry import register
-from tailgate.estimators.sparse_attacks.window import Centred, Decoded, Decoder, DecoderPlan, WindowPlan, floor_of, grams, least_squares, modelled
+from tailgate.estimators.sparse_attacks.window import (
+    Centred,
+    Decoded,
+    Decoder,
+    DecoderPlan,
+    WindowPlan,
+    floor_of,
+    grams,
+    least_squares,
+    modelled,
+)
 
 MOST = 3000  # linear programs in a step
 
@@ -112,7 +122,9 @@ def solve_milp(O: Array, Y: Array, D: Array, there: Array, big: float = 1e6) -> 
         np.array([*np.zeros(n), *np.ones(q)]), integrality=np.array([0] * n + [1] * q),
         bounds=(np.array([-np.inf] * n + [0.0] * q), np.array([np.inf] * n + [1.0] * q)),
         constraints=LinearConstraint(
-            np.concatenate([np.column_stack([rows, -big * on]), np.column_stack([-rows, -big * on])]), -np.inf, np.concatenate([y + d, d - y])
+            np.concatenate([np.column_stack([rows, -big * on]), np.column_stack([-rows, -big * on])]),
+            -np.inf,
+            np.concatenate([y + d, d - y]),
         ),
     )  # fmt: skip
     if answer.status != 0:
@@ -133,7 +145,7 @@ class RobustDecoder(Decoder):
     threshold_field: ClassVar[str] = "sigmas"
     sigmas: Positive = param(6.0, "bound of an honest error [standard deviations]")
     centre: Literal["least_squares", "chebyshev"] = param(
-        "least_squares", "least_squares: on the sensors that are left; chebyshev: the centre of the largest ball in the set, a linear program"
+        "least_squares", "least_squares: on the sensors that are left; chebyshev: centre of the largest ball in the set, a linear program"
     )
 
     def constants(self, plan: WindowPlan, model: Model) -> RobustPlan:

@@ -3,8 +3,9 @@
     min_x  f(x) = sum_i |Y_i - O_i x|_r,        r = 2: the norm of a sensor's window; r = 1: the sum over its readings
 
 Solved by Weiszfeld's method, weighted least squares with w = 1/|residual|, in the form of a correction, which keeps its digits however
-large an attack is. x is optimal where sum_i O_i' u_i = 0, with u_i = res_i/|res_i|, or |u_i| <= 1 where res_i = 0. A residual counts as no
-less than SMALLEST, so that the weights are finite; this moves f by at most that for each term.
+large an attack is. The least residual that counts starts at the largest one and falls, or the iteration could stick to a reading that it
+happens to meet. x is optimal where sum_i O_i' u_i = 0, with u_i = res_i/|res_i|, or |u_i| <= 1 where res_i = 0. At
+the end a residual counts as no less than SMALLEST; this moves f by at most that for each term.
 
 s sensors can be corrected where no x has sum_{i in K} |O_i x| >= sum_{i not in K} |O_i x| for any K of s sensors, without noise. Rows over
 the sensors' noise (`rows=sigmas`) break this where the most accurate sensors are attacked.
@@ -30,11 +31,13 @@ from tailgate.estimators.sparse_attacks.window import (
     least_squares,
     modelled,
     pulled,
+    solvable,
     weighed,
 )
 
 SMALLEST = 1e-9  # residual [unit of the rows]
 STILL = 1e-9  # a step whose effect on all rows is this small ends the iteration [unit of the rows]
+FALL = 0.7  # of the least residual that counts, a round
 Rounds = Annotated[int, Field(ge=1, le=100_000)]
 
 
@@ -49,18 +52,21 @@ class Windows(NamedTuple):
 def decoded(held: Windows, rounds: int) -> Array:
     """Return argmin of the sum of the groups' norms (B, N, n), in at most so many rounds."""
     gram, floor = grams(held.O, held.there), floor_of(held.O)
-    first = least_squares(held.O, held.Y, gram, np.ones(held.there.shape[:3]), floor)
+    every = np.ones(held.there.shape[:3])
+    first = least_squares(held.O, held.Y, gram, every, floor)
 
-    def step(x: Array) -> tuple[Array, list[Array]]:
+    r = np.where(held.there, held.Y - modelled(held.O, first), 0.0)
+    begin = np.maximum(np.max(np.abs(r), axis=(-2, -1)), SMALLEST)
+
+    def step(x: Array, least: Array) -> tuple[Array, list[Array]]:
         r = np.where(held.there, held.Y - modelled(held.O, x), 0.0)
-        w = 1.0 / np.sqrt(num.dot(r, r) + SMALLEST * SMALLEST)
-        G = weighed(w, gram)
-        scale = num.dot(w, np.ones(w.shape[-1]))[..., None]  # of the weights: the ridge is relative
-        move = num.matvec(num.inverse(G + floor * scale[..., None]), weighed(w, pulled(held.O, r)))
-        size = np.max(np.abs(modelled(held.O, move)), axis=(-2, -1))
-        return size > STILL, [x + move]
+        w = 1.0 / np.sqrt(num.dot(r, r) + (least * least)[..., None])
+        ridge = floor * np.min(w, axis=-1)[..., None, None]  # below what the least weight sees
+        move = num.matvec(num.inverse(solvable(weighed(w, gram) + ridge)), weighed(w, pulled(held.O, r)))
+        far = np.max(np.abs(modelled(held.O, move)), axis=(-2, -1))
+        return (far > STILL) | (least > SMALLEST), [x + move, np.maximum(FALL * least, SMALLEST)]
 
-    return num.until(step, [first], np.ones(first.shape[:2], bool), rounds)[0]
+    return num.until(step, [first, begin], np.ones(first.shape[:2], bool), rounds)[0]
 
 
 def grouped(O: Array, Y: Array, there: Array, norm: int) -> Windows:

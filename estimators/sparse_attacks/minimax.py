@@ -38,7 +38,7 @@ class MinimaxPlan(NamedTuple):
 @register("filter", "minimax", reference=PAPER)
 @dataclass(frozen=True)
 class MinimaxFilter:
-    """Predicts, and corrects by the middle of the corrections that small sets of sensors ask for; with half of the sensors attacked, by none."""
+    """Predicts, and corrects by the middle of what small sets of sensors ask for; with half of the sensors attacked, by nothing."""
 
     attacked: Count = param(1, ATTACKED)
 
@@ -52,7 +52,7 @@ class MinimaxFilter:
             raise InputError("filter minimax.attacked", l, f"fewer subsets than {max(comb(q, 2 * l), comb(q, l))}: at most {MOST}")
         I, J = without(q, 2 * l), without(q, l)
         bank = bank_plan(model, I)
-        inside = np.array([np.flatnonzero((I <= some).all(axis=1)) for some in J])
+        inside = np.array([np.flatnonzero((~I | some).all(axis=1)) for some in J])
         return MinimaxPlan(kalman._replace(held=self._steady(bank)), bank, inside)
 
     def _steady(self, bank: BankPlan) -> Array:

@@ -23,7 +23,16 @@ from tailgate.core.registry import register
 from tailgate.estimators.sparse_attacks.bank import BankPlan, bank_plan, bank_start, bank_step
 from tailgate.estimators.sparse_attacks.kf_bank import ATTACKED
 from tailgate.estimators.sparse_attacks.subsets import MOST, require, without
-from tailgate.estimators.sparse_attacks.window import WINDOW, Length, WindowPlan, WindowState, centred, window_plan, window_start, window_step
+from tailgate.estimators.sparse_attacks.window import (
+    WINDOW,
+    Length,
+    WindowPlan,
+    WindowState,
+    centred,
+    window_plan,
+    window_start,
+    window_step,
+)
 
 
 class WindowBank(NamedTuple):
@@ -93,7 +102,7 @@ class ObserverBank:
         if (count := comb(q, self.s) + comb(q, 2 * self.s)) > MOST:
             raise InputError("defence observer_bank.s", self.s, f"fewer estimates than {count}: at most {MOST}")
         J, S = without(q, self.s), without(q, 2 * self.s)
-        inside = np.array([np.flatnonzero((S <= some).all(axis=1)) for some in J])
+        inside = np.array([np.flatnonzero((~S | some).all(axis=1)) for some in J])
         window = window_plan(model, self.window) if self.kind == "gramian" else None
         most: BankPlan | WindowBank
         fewer: BankPlan | WindowBank

@@ -6,9 +6,9 @@
     project     keep the s blocks E_i of the largest norm, zero the others;   end where f <= eps
 
 `etpg` starts from E = 0 in each window. `etpl` goes on from its last z: x by A, E by a shift. x has coordinates in which O'O = I, so that
-|[O I]|^2 = 2 and the gradient's steps do not depend on how the states are scaled. eps is the energy T tr R that noise alone has. A window that
-passes the chi-square test of its least squares needs no attack: E = 0. The estimate is least squares on the sensors outside of the support
-of E, weighed by their noise.
+|[O I]|^2 = 2 and the gradient's steps do not depend on how the states are scaled. eps is the energy T tr R that noise alone has. A window
+that passes the chi-square test of its least squares needs no attack: E = 0. The estimate is least squares on the sensors outside of the
+support of E, weighed by their noise.
 """
 
 from dataclasses import dataclass
@@ -191,7 +191,7 @@ class ProjectedGradient(Relaxed):
 @register("defence", "etpg", reference=PAPER)
 @dataclass(frozen=True)
 class Etpg(ProjectedGradient):
-    """Event-triggered projected gradient: gradient steps on state and attack, projected on few attacked sensors when the error has fallen."""
+    """Event-triggered projected gradient: steps on state and attack, projected on few attacked sensors when the error has fallen."""
 
     name = "etpg"
 

@@ -68,6 +68,7 @@ def window_plan(model: Model, length: int) -> WindowPlan:
 
 
 def window_start(plan: WindowPlan, prior: Prior) -> WindowState:
+    """Return a window without a reading, for B episodes."""
     batch, agents, n = prior.mean.shape
     q, T = plan.O.shape[1:3]
     y = num.zeros((batch, agents, q, T))
@@ -98,8 +99,10 @@ def centred(plan: WindowPlan, state: WindowState) -> Centred:
     for t in range(1, T):
         xi = num.matvec(plan.A, xi) + state.pushed[..., t, :]
         columns.append(state.y[..., t] - num.matvec(plan.C, xi))
-    Y = np.where(state.there, np.stack(columns, axis=-1) / plan.sd[..., None], 0.0)
-    return Centred(Y, state.there, xi, state.steps == T, state.pushed[..., 0, :])
+    full = state.steps == T
+    there = state.there | ~full[..., None, None]  # before that, T readings of 0: a window that can be solved, for an answer nobody uses
+    Y = np.where(state.there & full[..., None, None], np.stack(columns, axis=-1) / plan.sd[..., None], 0.0)
+    return Centred(Y, there, xi, full, state.pushed[..., 0, :])
 
 
 def modelled(O: Array, x: Array) -> Array:
@@ -138,15 +141,27 @@ def grams(O: Array, there: Array) -> Array:
 
 
 def least_squares(O: Array, Y: Array, gram: Array, w: Array, floor: Array) -> Array:
-    """Return argmin sum_i w_i |Y_i - O_i x|^2 + floor |x|^2 (B, N, n); Y is 0 where nothing arrived, `gram` (B, N, q, n, n) leaves it out."""
+    """Return argmin sum_i w_i |Y_i - O_i x|^2 + floor |x|^2 (B, N, n).
+
+    Y is 0 where nothing arrived; `gram` (B, N, q, n, n) leaves it out.
+    """
     G = weighed(w, gram) + floor
     return num.matvec(num.inverse(G), weighed(w, pulled(O, Y)))
 
 
 def floor_of(O: Array) -> Array:
-    """Return a ridge (n, n) for rows in which too much is missing: 1e-12 of the largest gram's trace."""
+    """Return a ridge (n, n) for windows in which too much is missing: 1e-12 of the largest gram's trace."""
     size = float(np.max(np.sum(O * O, axis=(1, 2, 3))))
     return 1e-12 * size * np.eye(O.shape[-1])
+
+
+def solvable(G: Array) -> Array:
+    """Return G (B, N, n, n) with 1e-14 of its trace added to its diagonal: no pivot of it is 0."""
+    n = G.shape[-1]
+    trace = G[..., 0, 0]
+    for j in range(1, n):
+        trace = trace + G[..., j, j]
+    return np.asarray(G + 1e-14 * trace[..., None, None] * np.eye(n))
 
 
 class Decoded(NamedTuple):
@@ -214,7 +229,7 @@ class Relaxed(Decoder):
     """Base of decoders whose answer depends on how the rows of different sensors compare."""
 
     rows: Literal["readings", "sigmas"] = param(
-        "readings", "readings: rows as they are read, as in the papers; sigmas: over each sensor's noise, where an accurate one outvotes many"
+        "readings", "readings: rows as read, as in the papers; sigmas: over each sensor's noise, where an accurate one outvotes many"
     )
 
     def units(self, plan: WindowPlan) -> Array:
