@@ -1,4 +1,6 @@
-"""The hybrid Bernoulli filter (Forti, Battistelli, Chisci and Sinopoli 2016; thesis, [28]): is there an attack, and how large is it?
+"""The hybrid Bernoulli filter (Forti, Battistelli, Chisci and Sinopoli 2016; thesis, [28]).
+
+It asks: is there an attack, and how large is it?
 
 r is the probability that an attack exists; p0(x) the density without it, p1(x, a) the joint one with it. Each is a single Gaussian: where
 two meet, they are merged to one of the same mean and covariance. With birth p_b and survival p_s:
