@@ -7,10 +7,9 @@ import tailgate
 from tailgate.core.draws import keys
 from tailgate.core.scenario import load_scenario
 from tailgate.estimators.filters.bernoulli import Bernoulli
-from tailgate.estimators.mitigations.watermark import replay_mean
 from tailgate.estimators.sparse_attacks.l0_robust import RobustDecoder, explanation, feasible, solve_milp
 from tailgate.estimators.sparse_attacks.l1_decoder import L1Decoder, decoded, grouped
-from tailgate.estimators.sparse_attacks.projected import Etpg, Etpl, ProjectedPlan, orthonormal, restricted, solved
+from tailgate.estimators.sparse_attacks.projected import Etpg, Etpl, ProjectedPlan, orthonormal, solved
 from tailgate.estimators.sparse_attacks.window import Centred, pulled, weighed
 from tailgate.play.trace import rollout
 from tailgate.thesis import bounds
@@ -155,14 +154,14 @@ def test_without_attacked_sensors_etpg_is_least_squares_on_the_window(linear_mod
 def test_the_share_that_the_paper_needs_is_a_bound_on_random_directions():
     O, _, _, _ = _window(1, 4, 1.0)
     rows, _ = orthonormal(O)
-    share = restricted(rows, 1)[0]
+    share = bounds.restricted(rows, 1)[0]
     values = []
     for _ in range(2000):
         x, E = RNG.normal(size=3), np.zeros((7, 4))
         E[RNG.choice(7, 2, replace=False)] = RNG.normal(size=(2, 4))
         values.append(np.sum((rows[0] @ x + E) ** 2) / (x @ x + np.sum(E * E)) / 2.0)
     assert share <= min(values) < share + 0.3
-    assert restricted(rows, 0)[0] == pytest.approx(0.5)
+    assert bounds.restricted(rows, 0)[0] == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("name", ["l1_decoder", "etpg", "etpl", "l0_robust"])
@@ -297,9 +296,9 @@ def test_watermark_raises_the_statistic_under_replay():
     assert pytest.approx(2.4839, abs=1e-4) == S
     assert pytest.approx(0.161, abs=5e-4) == (A + L) * (1.0 - K)
     one = np.array([[1.0]])
-    wanted = replay_mean(A * one, one, one, L * one, K * one, S * one, Qu * one)
+    wanted = bounds.replay_mean(A * one, one, one, L * one, K * one, S * one, Qu * one)
     assert wanted == pytest.approx(1.413, abs=1e-3)
-    assert replay_mean(1.5 * one, one, one, 0.0 * one, 0.0 * one, S * one, Qu * one) == np.inf
+    assert bounds.replay_mean(1.5 * one, one, one, 0.0 * one, 0.0 * one, S * one, Qu * one) == np.inf
     batch, steps = 4000, 120
     x, xh, u, recorded, means = np.zeros(batch), np.zeros(batch), np.zeros(batch), [], {False: [], True: []}
     for k in range(2 * steps):

@@ -10,13 +10,14 @@ import tailgate
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Innovation
 from tailgate.core.draws import keys
+from tailgate.core.reach import sparsity
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
 from tailgate.estimators.detectors.sequential import WindowedChiSquare
 from tailgate.estimators.sparse_attacks.kf_bank import BlockResidue, KalmanBank, block_threshold
 from tailgate.estimators.sparse_attacks.minimax import Minimax
 from tailgate.estimators.sparse_attacks.observer_bank import ObserverBank
-from tailgate.estimators.sparse_attacks.subsets import correctable, sparsity, without
+from tailgate.estimators.sparse_attacks.subsets import correctable, without
 from tailgate.play.trace import rollout
 from tailgate.thesis import bounds
 from tests.readings import dense, play_readings, simulated

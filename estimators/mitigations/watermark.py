@@ -7,15 +7,12 @@ filter with gain K and the feedback u = L xh, with calA = (A + B L)(I - K C) sta
 
     q + 2 tr(C' S^-1 C U),        U = calA U calA' + B Qu B'
 
-Where calA is unstable the replay shows without a watermark.
+Where calA is unstable the replay shows without a watermark (`bounds.replay_mean`).
 """
 
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numpy as np
-
-from tailgate import num
 from tailgate.core import Array, Estimate, NonNegative, Positive, PositiveCount, Received, param
 from tailgate.core.draws import Draws
 from tailgate.core.registry import register
@@ -23,18 +20,6 @@ from tailgate.estimators.compose import AcceptAll, Composed, ComposedPlan, Compo
 from tailgate.estimators.detectors.sequential import WindowedChiSquare
 from tailgate.estimators.filters.kalman import KalmanFilter
 from tailgate.estimators.parts import Detector, Filter, Mitigation
-
-
-def replay_mean(A: Array, B: Array, C: Array, L: Array, K: Array, S: Array, Qu: Array) -> float:
-    """Return E r' S^-1 r under replay of a steady loop; infinite where calA is unstable."""
-    cal = (A + B @ L) @ (np.eye(len(A)) - K @ C)
-    if num.spectral_radius(cal) >= 1.0:
-        return float("inf")
-    U = added = B @ Qu @ B.T
-    while np.abs(added).max() > 1e-16 * np.abs(U).max():
-        added = cal @ added @ cal.T
-        U = U + added
-    return float(len(C) + 2.0 * np.trace(C.T @ np.linalg.solve(S, C @ U)))
 
 
 @register(

@@ -72,9 +72,8 @@ class KalmanBank:
         require(model, self.s, "defence kf_bank")
         keep = without(len(model.sensors), self.s)
         bank = bank_plan(model, keep)
-        h = block_threshold(self.alpha, len(keep), self.block, int(keep[0].sum())) if self.threshold is None else self.threshold
-        spread = bank.after.trace(axis1=-2, axis2=-1).sum(axis=0)
-        return KfBankPlan(bank, h, int(np.argmin(spread)))
+        h = block_threshold(self.alpha, len(keep), self.block, int(np.count_nonzero(keep[0]))) if self.threshold is None else self.threshold
+        return KfBankPlan(bank, h, int(np.argmin(np.max(bank.after.trace(axis1=-2, axis2=-1), axis=0))))
 
     def start(self, plan: KfBankPlan, prior: Prior) -> KfBankState:
         shape = prior.mean.shape[:2]

@@ -62,30 +62,31 @@ def feasible(O: Array, Y: Array, D: Array) -> Array | None:
     """Return an x (n,) with |Y - O x| <= D for rows O (M, n), Y and D (M,): the Chebyshev centre; None where there is none."""
     from scipy.optimize import linprog
 
-    size, n = np.linalg.norm(O, axis=1), O.shape[1]
+    size, n = np.sqrt(num.dot(O, O)), O.shape[1]
     A = np.concatenate([np.column_stack([O, size]), np.column_stack([-O, size])])
     answer = linprog(
         np.array([*np.zeros(n), -1.0]), A_ub=A, b_ub=np.concatenate([Y + D, D - Y]), bounds=[(None, None)] * n + [(0.0, None)],
         method="highs",
     )  # fmt: skip
     if answer.status == 3:  # unbounded: any centre will do
-        return fitted(O, Y)
+        return num.matvec(fitting(O), Y)
     return np.asarray(answer.x[:n]) if answer.status == 0 else None
 
 
-def fitted(O: Array, Y: Array) -> Array:
-    """Return the least squares (n,) of rows O (M, n) and Y (M,)."""
-    return np.asarray(np.linalg.lstsq(O, Y, rcond=None)[0])
+def fitting(O: Array) -> Array:
+    """Return the matrix (n, M) that makes the least squares of readings (M,) with rows O (M, n)."""
+    G = num.product(O.T, O)
+    return num.solve(G + 1e-13 * G.trace() * np.eye(len(G)), O.T)
 
 
-def explains(O: Array, Y: Array, D: Array) -> Array | None:
+def explains(O: Array, Y: Array, D: Array, fit: Array) -> Array | None:
     """Return an x (n,) with |Y - O x| <= D, the least squares where it will do; None where there is none."""
-    x = fitted(O, Y)
-    r = Y - O @ x
+    x = num.matvec(fit, Y)
+    r = Y - num.matvec(O, x)
     if (np.abs(r) <= D).all():
         return x
-    outside = np.eye(len(O)) - O @ np.linalg.pinv(O)
-    if (np.abs(r) > np.abs(outside) @ D + 1e-9 * (1.0 + np.abs(Y).max())).any():
+    outside = np.eye(len(O)) - num.product(O, fit)
+    if (np.abs(r) > num.matvec(np.abs(outside), D) + 1e-9 * (1.0 + np.abs(Y).max())).any():
         return None
     return feasible(O, Y, D)
 
@@ -95,16 +96,17 @@ def explanation(O: Array, Y: Array, D: Array, there: Array, s: int, centre: str 
 
     Where none does, the set of s whose least squares is outside of D by the smallest factor.
     """
-    q, best = len(O), (np.inf, Explained((), fitted(O[there], Y[there]), False))
+    q, best = len(O), (np.inf, Explained((), np.zeros(O.shape[-1]), False))
     for size in range(s + 1):
         for K in combinations(range(q), size):
             rows = there & ~np.isin(np.arange(q), K)[:, None]
-            x = explains(O[rows], Y[rows], D[rows])
+            fit = fitting(O[rows])
+            x = explains(O[rows], Y[rows], D[rows], fit)
             if x is not None:
                 inner = feasible(O[rows], Y[rows], D[rows]) if centre == "chebyshev" else None
                 return Explained(K, x if inner is None else inner, True)
-            x = fitted(O[rows], Y[rows])
-            over = float(np.max(np.abs(Y[rows] - O[rows] @ x) / D[rows]))
+            x = num.matvec(fit, Y[rows])
+            over = float(np.max(np.abs(Y[rows] - num.matvec(O[rows], x)) / D[rows]))
             if size == s and over < best[0]:
                 best = over, Explained(K, x, False)
     return best[1]
@@ -164,7 +166,7 @@ class RobustDecoder(Decoder):
         x = np.array(x)
         for b, i in np.argwhere(hard).tolist():
             Y, there = np.ascontiguousarray(held.Y[b, i]), np.ascontiguousarray(held.there[b, i])
-            if np.linalg.matrix_rank(O[i][there]) < O.shape[-1]:
+            if np.count_nonzero(there) < O.shape[-1]:
                 continue  # too much is missing to tell
             found = explanation(O[i], Y, D[i], there, self.s, self.centre)
             x[b, i], alarm[b, i] = found.x, bool(found.attacked) or not found.found

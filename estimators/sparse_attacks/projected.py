@@ -12,7 +12,6 @@ support of E, weighed by their noise.
 """
 
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
@@ -119,21 +118,6 @@ def solved(plan: ProjectedPlan, held: Centred, x: Array, E: Array, s: int, nu: f
     first = energy(left(x, E))
     x, E, last, projections = num.until(step, [x, E, first, np.zeros_like(first, np.int64)], first > plan.eps, rounds)
     return Solved(x, np.where(largest(E, s)[..., None], E, 0.0), last, projections)
-
-
-def restricted(O: Array, s: int) -> Array:
-    """Return lambda_min of [O I]'[O I] over x and any 2s blocks, as a share of its lambda_max, for each agent (N,).
-
-    The paper has a rate of convergence where it is above 4/9. O (N, q, T, n) has orthonormal columns: lambda = 1 -+ the singular values
-    of the blocks' rows.
-    """
-    q, n = O.shape[1], O.shape[3]
-    out = []
-    for rows in O:
-        chosen = combinations(range(q), min(2 * s, q))
-        worst = max((float(np.linalg.norm(rows[list(some)].reshape(-1, n), 2)) for some in chosen if some), default=0.0)
-        out.append((1.0 - worst) / 2.0)
-    return np.array(out)
 
 
 @dataclass(frozen=True)

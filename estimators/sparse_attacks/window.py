@@ -151,8 +151,8 @@ def least_squares(O: Array, Y: Array, gram: Array, w: Array, floor: Array) -> Ar
 
 def floor_of(O: Array) -> Array:
     """Return a ridge (n, n) for windows in which too much is missing: 1e-12 of the largest gram's trace."""
-    size = float(np.max(np.sum(O * O, axis=(1, 2, 3))))
-    return 1e-12 * size * np.eye(O.shape[-1])
+    rows = O.reshape(len(O), -1)
+    return np.asarray(1e-12 * float(np.max(num.dot(rows, rows))) * np.eye(O.shape[-1]))
 
 
 def solvable(G: Array) -> Array:
