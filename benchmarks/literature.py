@@ -1,6 +1,6 @@
 """The related works of the thesis's second chapter, played: results/literature-v0 and the figures and the table of docs/literature.md.
 
-    python benchmarks/literature.py [--method NAME ...] [--no-search] [--out results/literature-v0] [--scratch DIR]
+    python benchmarks/literature.py [--method NAME ...] [--no-search] [--show] [--out results/literature-v0] [--scratch DIR]
 
 Each method has four parts, each in its own file. Parts that exist are not played again:
 
@@ -8,6 +8,8 @@ Each method has four parts, each in its own file. Parts that exist are not playe
 * compromised: the position error under a bias on 0, 1, ..., 7 of the sensors, the most accurate first
 * listed: a bias of -30 on two sensors for 50 steps: collisions, and if the alarm sounds
 * searched: what the standard ensemble, budget quick, does where two sensors can be reached. With --no-search only what exists is shown
+
+--show plays nothing: figure and table are of the parts that exist.
 """
 
 import argparse
@@ -132,12 +134,14 @@ def figure(out: Path, held: dict[str, dict[str, Any]]) -> None:
     shown, axes = canvas(10.0, 4.6, 1, 2, width_ratios=[1.4, 1.0])
     ax = axes[0, 0]
     for i, (name, parts) in enumerate(held.items()):
+        if parts["compromised"] is None:
+            continue
         middle = [row["rmse"][1] for row in parts["compromised"]["rows"]]
         line = f"{'osD^v<>PX*h'[i % 11]}{'-' if i < 10 else ':'}"
         ax.plot(range(len(middle)), middle, line, color=f"C{i % 10}", markersize=4, label=name)
     ax.axvspan(2.5, 7.2, color="0.92", zorder=0)
-    ax.set(yscale="log", xlabel="sensors with a bias of -10 (7 in all)", ylabel="position RMSE during the bias [m], median")
-    ax.set_title("No method has no limit: s = 2 can be corrected", fontsize=10)
+    ax.set(yscale="log", xlabel="sensors with a bias of -10, of 7", ylabel="position RMSE during the bias [m], median")
+    ax.set_title("grey: more than the two that can be corrected", fontsize=10)
     ax.grid(alpha=0.3)
     ax = axes[0, 1]
     found = {name: parts["searched"] for name, parts in held.items() if parts["searched"]}
@@ -162,9 +166,11 @@ def table(held: dict[str, dict[str, Any]]) -> str:
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
     for name, parts in held.items():
-        clean, cell = parts["calibrated"], parts["searched"]
+        clean, cell, struck = parts["calibrated"], parts["searched"], parts["listed"]
+        if clean is None:
+            continue
         limit = f"{clean['threshold']:.4g}{'' if clean['settled'] else ' (not settled)'}" if "threshold" in clean else "none"
-        cells = [name, f"{clean['clean_rmse'][1]:.3f}", limit, f"{100 * parts['listed']['alarm']:.0f} %"]
+        cells = [name, f"{clean['clean_rmse'][1]:.3f}", limit, f"{100 * struck['alarm']:.0f} %" if struck else "-"]
         for key in ("listed", "found"):
             found = cell and cell[key]
             cells.append(f"{100 * found['damage']:.0f} % ({100 * found['low']:.0f} to {100 * found['high']:.0f})" if found else "-")
@@ -178,6 +184,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--method", action="append", choices=list(METHODS), help="only this one (repeatable; default: all)")
     parser.add_argument("--no-search", action="store_true", help="show only the searches that exist")
+    parser.add_argument("--show", action="store_true", help="play nothing; show the parts that exist")
     parser.add_argument("--out", type=Path, default=Path("results/literature-v0"), help="folder of the results")
     parser.add_argument("--scratch", type=Path, default=Path("runs/literature"), help="folder of the searches and of what they find")
     options = parser.parse_args()
@@ -195,7 +202,7 @@ def main() -> int:
                 writable_directory(options.out / kind, "--out")
                 for done, name in enumerate(names):
                     update(kind, number * len(names) + done, len(makers) * len(names), name)
-                    left_out = kind == "searched" and (options.no_search or name in SLOW)
+                    left_out = options.show or (kind == "searched" and (options.no_search or name in SLOW))
                     held[name][kind] = part(options.out, kind, name, None if left_out else partial(make, name))
     except (InputError, NotApplicable) as error:
         print(f"literature: error: {error}", file=sys.stderr)
