@@ -131,7 +131,8 @@ def part(out: Path, name: str, method: str, make: Callable[[], dict[str, Any]] |
 
 def figure(out: Path, held: dict[str, dict[str, Any]]) -> None:
     """Draw the error over the number of compromised sensors, and what the ensemble damages."""
-    shown, axes = canvas(10.0, 4.6, 1, 2, width_ratios=[1.4, 1.0])
+    found = {name: parts["searched"] for name, parts in held.items() if parts["searched"]}
+    shown, axes = canvas(10.0, 4.6, 1, 2, width_ratios=[1.4, 1.0]) if found else canvas(8.0, 4.6)
     ax = axes[0, 0]
     for i, (name, parts) in enumerate(held.items()):
         if parts["compromised"] is None:
@@ -143,8 +144,14 @@ def figure(out: Path, held: dict[str, dict[str, Any]]) -> None:
     ax.set(yscale="log", xlabel="sensors with a bias of -10, of 7", ylabel="position RMSE during the bias [m], median")
     ax.set_title("grey: more than the two that can be corrected", fontsize=10)
     ax.grid(alpha=0.3)
-    ax = axes[0, 1]
-    found = {name: parts["searched"] for name, parts in held.items() if parts["searched"]}
+    if found:
+        _found(axes[0, 1], found)
+    shown.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", fontsize=8, ncols=6)
+    write_atomic(out / "literature.png", png(shown))
+
+
+def _found(ax: Any, found: dict[str, dict[str, Any]]) -> None:
+    """Draw what the best listed and the best found attack damage."""
     for i, one in enumerate(found.values()):
         for key, colour, mark in (("listed", "C0", "o"), ("found", "C3", "s")):
             if one[key]:
@@ -155,8 +162,6 @@ def figure(out: Path, held: dict[str, dict[str, Any]]) -> None:
     ax.set_title("the best listed and the best found attack", fontsize=10)
     ax.legend(fontsize=8)
     ax.grid(alpha=0.3, axis="x")
-    shown.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", fontsize=8, ncols=6)
-    write_atomic(out / "literature.png", png(shown))
 
 
 def table(held: dict[str, dict[str, Any]]) -> str:
