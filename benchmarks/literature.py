@@ -7,7 +7,8 @@ Each method has four parts, each in its own file. Parts that exist are not playe
 * calibrated: the threshold for one false alarm in HOURS of clean driving, and the clean errors
 * compromised: the position error under a bias on 0, 1, ..., 7 of the sensors, the most accurate first
 * listed: a bias of -30 on two sensors for 50 steps: collisions, and if the alarm sounds
-* searched: what the standard ensemble, budget quick, does where two sensors can be reached. With --no-search only what exists is shown
+* searched: what scripts and programs of the standard ensemble, budget quick, do where two sensors can be reached. With --no-search only
+  what exists is shown
 
 --show plays nothing: figure and table are of the parts that exist.
 """
@@ -33,8 +34,10 @@ from tailgate.core import draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, load_scenario, load_suite
 from tailgate.core.spec_text import split_text
-from tailgate.ensemble.standard import attack
+from tailgate.ensemble.members import BUDGETS, Hunt, harvest
+from tailgate.ensemble.standard import jobs_of
 from tailgate.evaluation.calibrate import calibrate
+from tailgate.evaluation.stats import proportion
 from tailgate.play.trace import Trace, rollout
 
 METHODS = {
@@ -55,6 +58,7 @@ ORDER = ("lidar", "radar_long", "wheels", "radar_short", "v2v", "gnss", "camera"
 SCENARIO, SUITE, DOSE = "redundant-two-v0", "redundant-v0", 50
 HOURS, ONSETS, EPISODES = 0.1, 60, 100
 SEEDS, HORIZON, FIRST, LENGTH, BIAS = 20, 300, 100, 100, -10.0
+BUDGET, MEMBERS = "quick", ("scripts", "programs")  # all members take a quarter of an hour for each method
 LISTED = "fdi:trigger=near,threshold=40,value=-30"
 
 
@@ -111,9 +115,19 @@ def listed(text: str) -> dict[str, Any]:
 
 def searched(text: str, scratch: Path) -> dict[str, Any]:
     folder = writable_directory(scratch, "--scratch")
-    report = attack(load_suite(SUITE), text, scenarios=(SCENARIO,), doses=(DOSE,), budget="quick", episodes=EPISODES, out=folder)
-    cell: dict[str, Any] = json.loads(json.dumps(report["cells"][0]).replace(f"{folder}/", ""))
-    return {"defence": text} | cell
+    suite = load_suite(SUITE)
+    arena = jobs_of(suite, text, (SCENARIO,), (DOSE,), BUDGET, 0)[0].arena
+    members = harvest(Hunt(arena, BUDGETS[BUDGET], 0, folder, only=MEMBERS))
+
+    def harm(against: str) -> dict[str, Any]:
+        share = proportion(round(arena.confirmed(against, "report", 0, EPISODES)[0] * EPISODES), EPISODES)
+        return {"attack": against.replace(f"{folder}/", ""), "damage": share.value, "low": share.low, "high": share.high}
+
+    best = max((one.found[0] for one in members if one.found), key=lambda found: found.score)
+    tried = {one: arena.confirmed(one, "select", 0, EPISODES)[1] for one in suite.attacks if Spec("attack", one).entry.knowledge == "black"}
+    who = [{"member": one.member, "knowledge": one.knowledge, **harm(one.found[0].attack)} for one in members if one.found]
+    out = {"defence": text, "budget": BUDGET, "only": list(MEMBERS), "listed": harm(max(tried, key=lambda one: tried[one]))}
+    return out | {"found": harm(best.attack), "members": who}
 
 
 def part(out: Path, name: str, method: str, make: Callable[[], dict[str, Any]] | None) -> dict[str, Any] | None:
