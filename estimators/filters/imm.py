@@ -109,6 +109,15 @@ def mix(state: ImmState, moves: Array) -> list[tuple[KalmanState, Array]]:
     return out
 
 
+def merged(held: Sequence[KalmanState], weights: Sequence[Array]) -> KalmanState:
+    """Return the Gaussian with mean and covariance of a mixture of weights (B, N), up to a factor; the first alone where all are 0."""
+    total = _total(weights)
+    some = total > 0.0
+    w = [np.where(some, part / np.where(some, total, 1.0), 1.0 if j == 0 else 0.0) for j, part in enumerate(weights)]
+    x = _total([part[..., None] * one.x for part, one in zip(w, held, strict=True)])
+    return KalmanState(x, _spread(w, [one.P for one in held], [one.x - x for one in held]))
+
+
 def _spread(w: Sequence[Array], P: Sequence[Any], off: Sequence[Array]) -> Array:
     """Return sum_i w_i (P_i + off_i off_i') (B, N, n, n)."""
     if off[0].shape[-1] > SMALL:

@@ -72,6 +72,11 @@ def check_estimate(estimate: Estimate, model: Model, batch: int, k: Array) -> No
         if estimate.limits.shape != size:
             raise InputError("defence output limits", estimate.limits.shape, f"an array of shape {size}, the lower limits first")
         num.demand(estimate.limits[..., 0] <= estimate.limits[..., 1], "defence output limits", "limits", "the lower limits first", k)
+    if estimate.offset is not None:
+        size = (*shape, len(model.actuators))
+        if estimate.offset.shape != size:
+            raise InputError("defence output offset", estimate.offset.shape, f"an array of shape {size}")
+        num.demand(np.isfinite(estimate.offset), "defence output offset", "NaN or infinity", "finite numbers", k)
     known = ", ".join(f"{m.value} ({m.name})" for m in Mode)
     fits = (estimate.mode >= 0) & (estimate.mode < len(Mode))
     num.demand(fits, "defence output mode", "another number", f"one of {known}", k, estimate.mode)
@@ -258,6 +263,9 @@ class Loop:
             estimate = estimate._replace(probe=num.full(estimate.probe.shape, True, bool))
         assert received.v2v is not None
         controller, u = self.controller.step(plan.controller, state.controller, estimate, received.v2v, odometry)
+        if estimate.offset is not None:
+            u = u + estimate.offset
+            estimate = estimate._replace(offset=None)
         if estimate.limits is not None:
             u = np.clip(u, estimate.limits[..., 0], estimate.limits[..., 1])
             estimate = estimate._replace(limits=None)

@@ -205,7 +205,7 @@ class Estimate(NamedTuple):
 
     x (B, N, n), score (B, N) (higher is more suspect), alarm (B, N) bool, mode (B, N) int8 of `Mode`, probe (B, N) bool:
     False mutes the defence's own sensor in the next step. limits (B, N, m, 2), optional: the least and the largest command that the
-    defence lets the controller give; infinite where it does not care.
+    defence lets the controller give; infinite where it does not care. offset (B, N, m), optional: what the defence adds to the command.
     """
 
     x: Array
@@ -214,6 +214,7 @@ class Estimate(NamedTuple):
     mode: Array
     probe: Array
     limits: Array | None = None
+    offset: Array | None = None
 
 
 def pair_of(answer: object) -> tuple[Any, Estimate]:

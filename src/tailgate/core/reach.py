@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import combinations
+from math import comb
 
 import numpy as np
 
 from tailgate.base.errors import InputError
+from tailgate.base.memo import remembered
 from tailgate.core import Array, Model
 
+TOLERANCE = 1e-7  # singular values below this share of the largest are zero
+SUBSETS = 5000  # most that are looked through
 MARGIN = 1e-6  # eigenvalues this close to the unit circle do not die out, and singular values this small are zero
 
 
@@ -92,3 +97,41 @@ def require_detectable(model: Model, where: str) -> None:
             f"{where}: undetectable for agents", names,
             "for each agent a state that its own sensors and those of the agents that reach it can tell: every mode that does not die out",
         )
+
+
+def modes(A: Array) -> list[Array]:
+    """Return orthonormal bases (n, g) of the eigenvectors of each eigenvalue of A, complex."""
+    out = []
+    for z in eigenvalues(A):
+        _, values, rows = np.linalg.svd(A - z * np.eye(len(A)))
+        g = max(1, int(np.count_nonzero(values <= TOLERANCE * max(values[0], 1.0))))
+        out.append(rows[-g:].conj().T)
+    return out
+
+
+@remembered("A", "C")
+def sparsity(model: Model) -> Array:
+    """Return the largest k for each agent (N,) at which its own readings are k-sparse observable; -1 where they are not with all.
+
+    (A, C) is k-sparse observable where it stays observable without any k sensors (Fawzi, Tabuada and Diggavi 2014). By the test of Popov,
+    Belevitch and Hautus: C v = 0 for no eigenvector v of A, of each set of sensors that is left.
+    """
+    bases = modes(model.A)
+    return np.array([min(_seen(C, basis) for basis in bases) for C in model.C])
+
+
+def _seen(C: Array, basis: Array) -> int:
+    """Return without how many of the sensors C (q, n), whichever they are, all eigenvectors of a basis (n, g) are still seen."""
+    size = np.linalg.norm(C, axis=1, keepdims=True)
+    seen, g = (C / np.where(size > 0.0, size, 1.0)) @ basis, basis.shape[1]
+    q = len(seen)
+    if g == 1:
+        return int(np.count_nonzero(np.abs(seen[:, 0]) > TOLERANCE)) - 1
+    for k in range(q + 1):
+        if q - k < g or comb(q, k) > SUBSETS or not all(_rank(seen[list(rest)]) == g for rest in combinations(range(q), q - k)):
+            return k - 1
+    return q
+
+
+def _rank(seen: Array) -> int:
+    return int(np.count_nonzero(np.linalg.svd(seen, compute_uv=False) > TOLERANCE))

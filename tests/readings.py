@@ -1,0 +1,39 @@
+"""Played readings for the defences against sparse attacks."""
+
+import numpy as np
+
+from tailgate.core import Prior, Received
+from tailgate.core.draws import Role, keys
+
+
+def play_readings(defence, model, y, mean=None, valid=None):
+    """States and estimates of a defence over readings y (K, B, q) of one agent, from a prior of unit covariance."""
+    batch, n = y.shape[1], model.states
+    plan = defence.prepare(model)
+    mean = np.zeros((batch, 1, n)) if mean is None else mean
+    state = defence.start(plan, Prior(mean.copy(), np.broadcast_to(np.eye(n), (batch, 1, n, n)).copy()))
+    held, out = keys("train", range(batch)), []
+    for k, row in enumerate(y):
+        there = np.ones(row.shape, bool) if valid is None else valid[k]
+        received = Received(row[:, None].copy(), there[:, None].copy(), np.zeros((batch, 1)))
+        state, estimate = defence.step(plan, state, received, np.zeros((batch, 1, model.inputs)), held.at(Role.DEFENCE, np.full(batch, k)))
+        out.append((state, estimate))
+    return plan, out
+
+
+def simulated(model, steps, batch, rng):
+    """True states (K, B, n) and readings (K, B, q) of a linear model without input."""
+    x, xs, ys = np.zeros((batch, model.states)), [], []
+    noise, spread = np.linalg.cholesky(model.R[0]), np.linalg.cholesky(model.Q + 1e-18 * np.eye(model.states))
+    for _ in range(steps):
+        x = x @ model.A.T + rng.normal(size=x.shape) @ spread.T
+        xs.append(x)
+        ys.append(x @ model.C[0].T + rng.normal(size=(batch, len(model.sensors))) @ noise.T)
+    return np.array(xs), np.array(ys)
+
+
+def dense(linear_model, rng, n=3, q=7, Q=1e-6, R=1.0):
+    """A random dense model on the edge of stability."""
+    A = rng.normal(size=(n, n))
+    A /= np.max(np.abs(np.linalg.eigvals(A)))
+    return linear_model(A, rng.normal(size=(q, n)), Q * np.eye(n), R * np.eye(q))
