@@ -30,6 +30,7 @@ from tailgate.core.schema import as_data, canonical
 from tailgate.core.threat import Brief
 from tailgate.engine.cards import DeviceError, device, playing_on
 from tailgate.evaluation.devices import check_cells
+from tailgate.evaluation.frame import Rows
 from tailgate.evaluation.resume import complete
 from tailgate.evaluation.rounds import numbered
 from tailgate.evaluation.rows import packed
@@ -267,8 +268,8 @@ def evaluate(
     beacon: str = "",
     progress: Callable[[int, int], None] | None = None,
     device: str | None = None,
-) -> list[dict[str, Any]]:
-    """Play a suite, or the part of it given by the arguments, and return its rows.
+) -> Rows:
+    """Play a suite, or the part of it given by the arguments, and return its rows: a list, which a notebook shows as a table.
 
     Parameters
     ----------
@@ -326,4 +327,4 @@ def evaluate(
                     rows += run_cell(cell, defence, attack)
     if out is not None and len(rows) > sum(cell.seeds for cell in cells):
         write_atomic(Path(out), packed(rows, Path(out)))  # with the rows of objects
-    return rows
+    return Rows(rows)

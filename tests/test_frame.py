@@ -1,0 +1,51 @@
+"""Rows in a notebook."""
+
+import sys
+
+import pytest
+
+import tailgate
+from tailgate.evaluation.frame import SHOWN, Rows
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return tailgate.evaluate(
+        scenarios=["stop-and-go-v0"], defences=["kf", "chi2_kf"], attacks=["none", "fdi:trigger=near,threshold=40,value=-4"], seeds=3
+    )
+
+
+def test_a_row_for_each_episode(rows):
+    """An evaluation stays a list, and is a DataFrame with the metrics of the rows."""
+    pytest.importorskip("pandas")
+    frame = rows.to_pandas()
+    assert isinstance(rows, list) and len(frame) == len(rows) == 12
+    assert frame["min_gap"].tolist() == [row["min_gap"] for row in rows] and frame["threat_model"][0] == rows[0]["threat_model"]
+    assert frame.groupby("defence")["crashed"].mean().to_dict() == {
+        name: sum(row["crashed"] for row in rows if row["defence"] == name) / 6 for name in ("kf", "chi2_kf")
+    }
+
+
+def test_a_line_for_each_cell(rows):
+    pytest.importorskip("pandas")
+    frame, entries = rows.to_pandas(cells=True), rows.summary()
+    assert len(frame) == 4 and frame["crash.high"].tolist() == [entry["crash"]["high"] for entry in entries]
+
+
+def test_a_notebook_shows_cells(rows):
+    """Names of others are text there; of many cells some are shown, and how many there are beyond."""
+    page = rows._repr_html_()
+    assert page.count("<tr>") == 5 and "0.0% (0.0% to 70.8%)" in page and "12 episodes in 4 cells" in repr(rows)
+    many = Rows(row | {"attack": f"<b>{i}"} for i in range(SHOWN + 2) for row in rows[:1])
+    assert "&lt;b&gt;0" in many._repr_html_() and "<b>" not in many._repr_html_() and "and 2 more cells" in many._repr_html_()
+
+
+def test_rows_that_did_not_play_say_why(rows):
+    skipped = Rows(row | {"status": "skipped", "reason": "no radar here", "min_gap": None} for row in rows[:3])
+    assert "no radar here" in skipped._repr_html_()
+
+
+def test_without_pandas_one_line_says_which_extra(rows, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match=r"pip install 'tailgate\[pandas\]'"):
+        rows.to_pandas()
