@@ -1,4 +1,4 @@
-"""A Ray cluster beside local workers: what it costs, what lost workers cost, and how fast the driver is.
+"""A Ray cluster against local workers: what it costs, what lost workers cost, and how fast the driver is.
 
     python benchmarks/cluster.py [--episodes 100000] [--tasks 1000000] [--out benchmarks/results]
 

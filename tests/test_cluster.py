@@ -89,8 +89,15 @@ def test_an_address_asks_for_the_engine(capsys):
     assert "--address: got 'head:6379'; expected --engine ray" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("address", ["localhost:1", "nowhere", "nowhere.invalid:6379"])
-def test_a_cluster_that_does_not_answer_is_one_clear_error(address, capsys):
+@pytest.mark.parametrize(
+    ("address", "expected"),
+    [
+        ("localhost:1", "HOST:PORT of a Ray cluster that answers"), ("nowhere.invalid:6379", "HOST:PORT of a Ray cluster that answers"),
+        ("nowhere", "HOST:PORT, for example"), ("head:99999", "HOST:PORT, for example"), ("head:", "HOST:PORT, for example"),
+    ],
+)  # fmt: skip
+def test_a_cluster_that_does_not_answer_is_one_clear_error(address, expected, capsys):
     pytest.importorskip("ray")
     assert cli.main(["evaluate", "--engine", "ray", "--address", address, "--seeds", "1"]) == 2
-    assert f"--address: got '{address}'; expected HOST:PORT of a Ray cluster that answers" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert f"--address: got '{address}'; expected {expected}" in error and error.count("\n") == 1

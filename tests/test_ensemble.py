@@ -185,7 +185,7 @@ def test_starts(monkeypatch):
         "fdi:trigger=near,threshold=40,value=-2,targets=[velocity]",
     )
     starts = starts_of(place, "black", [script], 0)
-    forms = ["hidden layer of 16, 1 frame", "linear, 4 frames", "linear, 1 frame, a ramp"]
+    forms = ["hidden layer of 16, 1 frame", "linear, 4 frames", "linear, 1 frame, a ramp from -1 by 0.2"]
     names = [f"{name} ({form})" for form in forms for name in ("rest", f"as {script}")]
     assert [start.name for start in starts[:6]] == names and "-chi2_kf-" in starts[6].name
     assert {"fdi-*0.5:velocity", "fdi+", "dos_jam:position"} <= {mode.name for mode in starts[1].plan.action.modes}
@@ -200,6 +200,14 @@ def test_a_published_start_keeps_its_kinds(tmp_path):
     assert attacks
     again, _ = as_evaluated(place, f"zoo:name={start.name.partition(' ')[2]}")
     np.testing.assert_array_equal(wanted.gap, again.gap)
+
+
+def test_no_two_starts_share_a_name():
+    """Their files are named by it: two ramps, one of a script of one size, have two names."""
+    place = arena("car", threat={"kinds": ("dos_jam", "fdi"), "fdi_bound": 4.0})
+    scripts = [f"{name},trigger=near,threshold=40" for name in ("fdi:value=-2", "fdi_ramp:base=-2.4,rate=0.5")]
+    names = [one.name for one in starts_of(place, "black", scripts, 0)]
+    assert len(set(names)) == len(names) and sum("a ramp from" in name for name in names) == 4
 
 
 def test_a_ramp_is_learned_in_its_steps():

@@ -104,9 +104,11 @@ def _done(digest: str, function: Callable[..., object], arguments: tuple[object,
 def _answers(address: str) -> None:
     """Raise InputError unless something listens at HOST:PORT. Ray itself would wait for minutes."""
     host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or int(port) > 65_535:
+        raise InputError("--address", address, "HOST:PORT, for example head:6379")
     try:
         socket.create_connection((host.strip("[]"), int(port)), PATIENCE).close()
-    except (OSError, ValueError) as error:
+    except OSError as error:
         raise InputError("--address", address, f"HOST:PORT of a Ray cluster that answers ({said(error)})") from None
 
 

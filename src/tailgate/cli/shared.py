@@ -37,7 +37,7 @@ OPTIONS: dict[str, dict[str, Any]] = {  # that several commands have in the same
     "--workers": {"type": int, "default": 1, "metavar": "N", "help": "processes (default 1); changes no result"},
     "--device": {"default": "cpu", "metavar": "NAME", "help": "where episodes are played: cpu (default) or cuda; changes no result"},
     "--engine": {"default": "local", "choices": ["local", "ray"], "help": "where workers run: this machine (default), or a Ray cluster"},
-    "--address": {"metavar": "HOST", "help": "of the Ray cluster (default: one on this machine, which ends with the command)"},
+    "--address": {"metavar": "HOST:PORT", "help": "of the head of a cluster (default: one on this machine, for this command)"},
     "--sample-seed": {"type": int, "metavar": "N", "help": "which ones (default: a new secret each time; the report names it)"},
     "--out": {"required": True, "metavar": "DIR", "help": "folder of the boards"},
     "--title": {"help": "title of the page"},

@@ -26,6 +26,7 @@ from tailgate.agents.policy.zoo import ZooAttack, zoo_names
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, draws
 from tailgate.core.draws import Keys, Role
+from tailgate.core.kinds import Kind
 from tailgate.core.loop import Loop
 from tailgate.core.neural import Network
 from tailgate.core.registry import Spec
@@ -254,9 +255,10 @@ def _drawn(
     def shown(script: str) -> Demonstration:
         return demonstrate(seat, Spec("attack", script).make(), seed, episodes)
 
-    out = []
+    out, first = [], action.delay if Kind.ECHO_DELAY in codec.carried else action.value
+    moved = f", a ramp from {first:.4g} by {action.rate:.4g}" if action.action == "ramp" else ""
     for form, script in itertools.product(forms, ("", *scripts)):
-        name = f"{f'as {script}' if script else 'rest'} ({form}{', a ramp' if action.action == 'ramp' else ''})"
+        name = f"{f'as {script}' if script else 'rest'} ({form}{moved})"
         if only and name not in only:
             continue
         seen = ObservationCodec(loop.brief, form.frames)
