@@ -16,7 +16,7 @@ from tailgate.play.trace import rollout
 from tailgate.trust.affine import AffineLoop, Step, affine_loop, probed
 from tailgate.trust.prove import admissible, closed_form, keeps, message_delay, prove, reacting
 from tailgate.trust.signals import SafeDistance
-from tailgate.trust.tube import Tube
+from tailgate.trust.tube import Tube, quantile_of
 
 RUNS, STEPS = 10_000, 150
 LANE, CAR, NETWORK = "lane-keeping-v0", "gusty-stop-and-go-v0", "linear-stealth-v0"
@@ -153,6 +153,28 @@ def test_ten_thousand_runs_behind_a_leader_stay_inside_of_the_tube():
     gap = np.concatenate([trace.first["gap"][None], trace.gap[:-1]])[:, :, 0]  # before the step, as the tube has it
     kept, used = inside(tube, trace, size, gap)
     assert kept == 1.0 and used > 0.1
+
+
+@pytest.mark.parametrize("noise", [None, "uniform"])
+def test_ten_thousand_runs_stay_inside_of_the_gaussian_tube_whatever_the_law_of_the_sensor(noise):
+    """With a probability of 99 %; the deviation of the error is the one that the tube has."""
+    place = car()
+    place = dataclasses.replace(place, sensor=dataclasses.replace(place.sensor, noise=noise))
+    trace, tube = play(place), Tube(affine_loop(place), alpha=0.01)
+    error = (trace.estimate - trace.truth)[:, :, 0]
+    kept = np.abs(error - tube.error.centre[:, None]) <= tube.wide["error"][:, None]
+    assert kept.all(axis=(0, 2)).mean() > 0.99
+    assert np.allclose(error.std(axis=1), np.sqrt(tube.error.variance), rtol=0.06)
+
+
+def test_the_quantile_of_uniform_noise_covers_sums_of_it():
+    rng = np.random.default_rng(3)
+    for many in (1, 2, 5):
+        weights = rng.uniform(0.2, 1.0, (many, 1))
+        total = (weights * 3.0**0.5 * rng.uniform(-1.0, 1.0, (many, 200_000))).sum(axis=0) / np.sqrt((weights**2).sum())
+        for tail in (0.3, 0.1, 0.01, 1e-3):
+            assert (total > quantile_of(tail, True)).mean() <= tail
+    assert quantile_of(0.025, False) == pytest.approx(1.95996, abs=1e-5)
 
 
 def test_the_variance_is_that_of_the_loop():

@@ -23,6 +23,7 @@ from tailgate.envs.controllers.adaptive_cruise import LEADER
 from tailgate.estimators.filters.kalman import steady_state
 
 SETTLE = 300  # steps before an episode that begins at rest
+UNIFORM = 3.0**0.5  # standard deviations from the middle of a uniform law to its end
 SPREAD = 4.0  # standard deviations of noise that count as its largest value
 FAR = 1e9  # beyond every limit of a controller
 LINEAR = 1e-6  # by how much a controller may differ from its linear form, relative
@@ -71,6 +72,8 @@ class AffineLoop:
     chance: int = 0  # of the bounded inputs, the first that are noise; the others are the leader's or the road's
     begun: int = 0  # of the generators of the start, the first that are noise
     burn: int = 0  # first steps that nobody looks at: the loop settles
+    lengths: tuple[float, ...] = ()  # of each bounded input that is noise, the generator's standard deviations; empty: `spread` of all
+    uniform: bool = False  # the readings' noise is uniform: its generators hold all of it
 
 
 def probed(controller: Any, model: Model) -> Law:
@@ -265,7 +268,7 @@ def affine_loop(
     return AffineLoop(
         model, law, made, start, box, rows, speeds, (k >= threat.onset) & (k <= last), budget,
         1.0 / place.manoeuvre.radius[0] if model.lane else 0.0,
-        spread, made[0].N.shape[1] - out.E.shape[1], box.shape[1] - out.E.shape[1], burn,
+        spread, made[0].N.shape[1] - out.E.shape[1], box.shape[1] - out.E.shape[1], burn, *_lengths(place, model, spread),
     )  # fmt: skip
 
 
@@ -276,9 +279,18 @@ def _noise(place: Scenario, model: Model, spread: float) -> tuple[Array, Array]:
     Q = model.Q if not isinstance(told, float) else np.eye(model.states) * told
     other = getattr(sensor, "noise_var", None)
     R = np.eye(len(model.sensors)) * other if isinstance(other, float) else model.R[0]
-    if getattr(sensor, "noise", None) == "uniform":
-        spread = min(spread, 3.0**0.5)
-    return _box(Q, spread), _box(R, spread)
+    return _box(Q, spread), _box(R, UNIFORM if _uniform(place) else spread)
+
+
+def _uniform(place: Scenario) -> bool:
+    return getattr(place.sensor, "noise", None) == "uniform"
+
+
+def _lengths(place: Scenario, model: Model, spread: float) -> tuple[tuple[float, ...], bool]:
+    """Return how many standard deviations each generator of `_noise` is long, and if the readings' noise is uniform."""
+    process, readings = _noise(place, model, spread)
+    uniform = _uniform(place)
+    return (spread,) * process.shape[1] + (UNIFORM if uniform else spread,) * readings.shape[1], uniform
 
 
 def _box(cov: Array, spread: float) -> Array:
