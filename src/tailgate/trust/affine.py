@@ -20,7 +20,9 @@ from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Estimate, Model
 from tailgate.core.scenario import Scenario
 from tailgate.envs.controllers.adaptive_cruise import LEADER
+from tailgate.core.threat import Brief
 from tailgate.estimators.filters.kalman import steady_state
+from tailgate.trust.leaders import accelerations
 
 SETTLE = 300  # steps before an episode that begins at rest
 UNIFORM = 3.0**0.5  # standard deviations from the middle of a uniform law to its end
@@ -168,7 +170,8 @@ def outside_of(place: Scenario, model: Model, delay: int, stale: bool, lead: tup
     plant, manoeuvre = place.plant, place.manoeuvre
     if model.lane:
         if delay or lead is not None:
-            raise InputError("--delay, --lead-accel", delay or lead, "none: nobody sends a message in a lane that drives ahead")
+            given = ("--lead-accel", lead) if lead is not None else ("delay", delay)
+            raise InputError(given[0], given[1], "nothing: nobody who drives ahead is in the loop of a lane")
         radius, ease = getattr(manoeuvre, "radius", None), getattr(manoeuvre, "ease", None)
         if radius is None or ease is None:
             raise NotApplicable("--prove: manoeuvre", type(manoeuvre).__name__, "curves")
@@ -184,7 +187,7 @@ def outside_of(place: Scenario, model: Model, delay: int, stale: bool, lead: tup
     if model.v2v[:2] != LEADER or model.agents != 1 or place.truth:
         wanted = "car_following, lane_keeping, or a network of one agent without a controller"
         raise NotApplicable("--prove: plant", type(plant).__name__, wanted)
-    low, high = lead if lead is not None else _accelerations(manoeuvre)
+    low, high = lead if lead is not None else accelerations(manoeuvre)
     dt, many = model.dt, 2 * (1 + delay)
     Z, E, z0 = np.zeros((many, many)), np.zeros((many, 1)), np.zeros(many)
     Z[0, :2], Z[1, 1] = (1.0, dt), 1.0
@@ -201,15 +204,9 @@ def outside_of(place: Scenario, model: Model, delay: int, stale: bool, lead: tup
     return Outside(Z, E, z0, start, heard, np.zeros((0, many)), ((np.array(model.gap)[0], ahead, 0.0),))
 
 
-def _accelerations(manoeuvre: Any) -> tuple[float, float]:
-    """Return the smallest and the largest acceleration of a leader [m/s^2]."""
-    for low, high in (("decel", "accel_rate"), ("limit", "limit"), ("decel", ""), ("value", "value")):
-        if hasattr(manoeuvre, low):
-            least = float(getattr(manoeuvre, low))
-            if low == "value":
-                return min(least, 0.0), max(least, 0.0)
-            return -least, float(getattr(manoeuvre, high)) if high else 0.0
-    raise NotApplicable("--prove: manoeuvre", type(manoeuvre).__name__, "one that bounds its acceleration; --lead-accel says other bounds")
+def injectable(brief: Brief) -> Array:
+    """Return (w,) bool: the wires of agent 0 that false data may be injected on, granted and not authenticated."""
+    return np.asarray(brief.granted[0] & ~brief.sealed)
 
 
 def affine_loop(
@@ -242,19 +239,19 @@ def affine_loop(
     if not 0.0 < spread <= 100.0:
         raise InputError("--spread", spread, "standard deviations, above 0 and at most 100")
     if not 0 <= delay <= 100:
-        raise InputError("--delay", delay, "steps, 0 to 100")
-    if lead is not None and not lead[0] <= lead[1]:
-        raise InputError("--lead-accel", list(lead), "two numbers, the smaller first")
+        raise InputError("delay", delay, "steps, 0 to 100")
+    if lead is not None and not -np.inf < lead[0] <= lead[1] < np.inf:
+        raise InputError("--lead-accel", list(lead), "two finite numbers, the smaller first")
     brief = place.brief()
     model, threat = brief.model, brief.threat
     if model.agents != 1 or place.truth:
         raise NotApplicable("--prove: scenario", place.name, "one agent, whose vehicle is the one that is known")
-    granted = brief.granted[0]
+    granted = injectable(brief)
     q, n, many = len(model.sensors), model.states, place.horizon if steps is None else min(steps, place.horizon)
     if granted[q:].any():
         raise NotApplicable("--prove: threat_model.targets", list(threat.targets), "sensors, not messages or actuators")
+    out = outside_of(place, model, delay, stale, lead, bound)  # first: a controller of another plant may not be asked at all
     law = probed(place.controller, model) if model.actuators else None
-    out = outside_of(place, model, delay, stale, lead, bound)
     first = _start(place, model, spread)
     burn = SETTLE if at_rest else 0
     K = gains(model, first[2], burn + many, at_rest)

@@ -104,7 +104,9 @@ class Tube:
 
     def __init__(self, loop: AffineLoop, bound: float | None = None, alpha: float | None = None) -> None:
         if alpha is not None and not 0.0 < alpha < 1.0:
-            raise InputError("--alpha", alpha, "a number above 0 and below 1")
+            raise InputError("--gaussian", alpha, "a number above 0 and below 1")
+        if bound is not None and not 0.0 < bound < np.inf:
+            raise InputError("--bound", bound, "a finite number above 0")
         self.loop, self.bound, self.alpha, many = loop, bound, alpha, len(loop.steps)
         self.gap = self._constant([row for row, _ in loop.gaps], many)
         self.gap_offset = np.array([offset for _, offset in loop.gaps])
