@@ -249,9 +249,21 @@ def test_a_late_message_is_worse_only_if_it_is_led_on():
         stale: [Tube(affine_loop(place, at_rest=True, lead=(-0.5, 0.5), delay=d, stale=stale)).under(0.0).gap for d in (0, 5, 20)] for stale in (True, False)
     }
     assert gaps[True] == sorted(gaps[True]) and gaps[False] == sorted(gaps[False], reverse=True) and gaps[True][0] == gaps[False][0]
-    found = message_delay(dataclasses.replace(place, controller=dataclasses.replace(place.controller, standstill=0.5, headway=1.0)), 0.0, None, at_rest=True, lead=(-0.5, 0.5))
-    kept = [row["delay"] for row in found["tried"] if row["gap"] > 0.0]
-    assert found["largest"] == (kept[-1] if kept else None) and kept == list(range(len(kept)))
+
+
+def test_the_largest_delay_is_the_one_at_which_an_attack_uses_up_the_gap():
+    """An injection that leaves a centimetre at 3 steps of delay takes it at 4; one that takes all without a delay leaves no delay."""
+    rest = {"at_rest": True, "lead": (-0.5, 0.5)}
+    place = car(targets=("position",))
+    place = dataclasses.replace(place, controller=dataclasses.replace(place.controller, standstill=2.0, headway=0.5))
+    tubes = [Tube(affine_loop(place, delay=delay, **rest)) for delay in range(5)]
+    step = int(np.argmin(tubes[3].lower_gap(0.0)))
+    size = (tubes[3].lower_gap(0.0)[step] - 0.01) / tubes[3].pushed["gap"][step, 0]
+    gaps = [tube.lower_gap(size).min() for tube in tubes]
+    assert gaps == sorted(gaps, reverse=True) and gaps[3] == pytest.approx(0.01, abs=1e-6) and gaps[4] < -0.01
+    found = message_delay(place, size, None, **rest)
+    assert found["largest"] == 3 and [row["delay"] for row in found["tried"]] == [0, 1, 2, 3, 4]
+    assert message_delay(place, 2.0 * size, None, **rest)["largest"] is None
 
 
 def test_what_is_not_linear_is_refused():
