@@ -343,7 +343,7 @@ def test_an_authenticated_wire_takes_no_injection():
 
 @pytest.mark.parametrize("bound", [float("nan"), float("inf"), -3.0, 0.0])
 def test_a_bound_is_a_finite_number_above_zero(bound):
-    with pytest.raises(InputError, match="--bound.*finite number above 0"):
+    with pytest.raises(InputError, match=r"--bound.*finite number above 0"):
         prove(NETWORK, bound=bound)
 
 
@@ -351,7 +351,7 @@ def test_a_bound_is_a_finite_number_above_zero(bound):
     ("words", "named"),
     [
         (["--prove", "--defence", "chi2_kf"], "--defence"), (["--prove", "--attack", "none"], "--attack"), (["--prove", "--suite", "lane-v0"], "--suite"),
-        (["--prove", "--runs", "5"], "--runs"), (["--prove", "--out", "x"], "--out"), (["--prove", "--dose", "5", "--dose", "20"], "--dose"),
+        (["--prove", "--runs", "5"], "--runs"), (["--prove", "--out", "x"], "--out"), (["--prove", "--alpha", "0.01"], "--alpha"), (["--prove", "--dose", "5", "--dose", "20"], "--dose"),
         (["--prove", "--automata", "telematics"], "--automata"), (["--prism", "x.prism"], "--prism"), (["--bound", "3"], "--bound"), (["--delays"], "--delays"),
         (["--automata", "telematics", "--at-rest"], "--at-rest"), (["--automata", "telematics", "--out", "x"], "--out"),
         (["--prove", "--property", "gap > 2"], "--property"), (["--prove", "--gaussian", "1.5"], "--gaussian"), (["--prove", "--bound", "nan", "--json"], "--bound"),

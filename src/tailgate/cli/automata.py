@@ -10,9 +10,9 @@ from tailgate.base.errors import InputError
 from tailgate.cli.prove import refuse
 from tailgate.cli.shared import show, table, tell
 
-
 _PLAYED = (
-    "suite", "defence", "attack", "scenario", "dose", "threat", "property", "precision", "unsafe", "demand", "width", "test", "beacon", "out",
+    "suite", "defence", "attack", "scenario", "dose", "threat", "property", "precision", "unsafe", "demand", "width", "test", "beacon",
+    "out", "alpha", "confidence", "indifference",
 )  # options of trust that a chain does not read
 
 

@@ -10,20 +10,21 @@ from tailgate.base.errors import InputError
 from tailgate.cli.shared import counted, say, show, table, values, working
 from tailgate.core.schema import scalar
 
-
 _PLAYED = (
-    "suite", "attack", "property", "runs", "precision", "unsafe", "demand", "width", "test", "beacon", "out",
+    "suite", "attack", "property", "runs", "precision", "unsafe", "demand", "width", "test", "beacon", "out", "alpha", "confidence",
+    "indifference",
 )  # options of trust that a proof does not read
 _PROOFS = {
-    "bound": None, "at_rest": False, "spread": 4.0, "gaussian": None, "lead_accel": None, "no_set_speed": False, "delays": False, "stale": False,
-    "steps": None,
+    "bound": None, "at_rest": False, "spread": 4.0, "gaussian": None, "lead_accel": None, "no_set_speed": False, "delays": False,
+    "stale": False, "steps": None,
 }  # options of proofs, and what they are if nobody gives them
+_UNSAID = _PROOFS | {"alpha": 0.05, "confidence": 0.99, "indifference": 0.05}
 
 
 def refuse(options: argparse.Namespace, names: Iterable[str], by: str) -> None:
     """Raise InputError for the first of these options that is given, as `by` does not read it."""
     for name in names:
-        if (value := getattr(options, name)) not in (_PROOFS.get(name), None, [], ""):
+        if (value := getattr(options, name)) not in (_UNSAID.get(name), None, [], ""):
             raise InputError(f"--{name.replace('_', '-')}", value, f"nothing: {by} does not read it")
 
 
@@ -33,7 +34,8 @@ def add_prove(command: argparse.ArgumentParser) -> None:
     group.add_argument("--prove", action="store_true", help="what is proved of a scenario under kf: reachable sets and a closed form")
     group.add_argument("--bound", type=float, metavar="E", help="size of an error that counts as damage, where nobody drives")
     group.add_argument("--at-rest", action="store_true", help="the loop has settled before the first step")
-    group.add_argument("--spread", type=float, default=_PROOFS["spread"], metavar="S", help="largest noise, in standard deviations (default 4)")
+    spread = _PROOFS["spread"]
+    group.add_argument("--spread", type=float, default=spread, metavar="S", help="largest noise, in standard deviations (default 4)")
     group.add_argument("--gaussian", type=float, metavar="A", help="Gaussian noise instead, and all ranges hold together with 1 - A")
     group.add_argument("--lead-accel", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of the leader's acceleration [m/s^2]")
     group.add_argument("--no-set-speed", action="store_true", help="take the set speed away, which makes the cruise control linear")

@@ -19,8 +19,8 @@ import numpy as np
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Estimate, Model
 from tailgate.core.scenario import Scenario
-from tailgate.envs.controllers.adaptive_cruise import LEADER
 from tailgate.core.threat import Brief
+from tailgate.envs.controllers.adaptive_cruise import LEADER
 from tailgate.estimators.filters.kalman import steady_state
 from tailgate.trust.leaders import accelerations
 

@@ -228,8 +228,8 @@ def lasting(chain: Chain) -> Array:
     """Return the distribution (S,) in the long run, from the secure state.
 
     From every state all nodes that can be reached may be exploited next, so that one class of states is never left. Up to DENSE states it
-    is solved by elimination without a subtraction (Grassmann, Taksar and Heyman, Operations Research 1985). That is exact to a few roundings
-    of each state's share, whatever the sizes of the rates. A larger chain is stepped (`_stepped`).
+    is solved by elimination without a subtraction (Grassmann, Taksar and Heyman, Operations Research 1985). That is exact to a few
+    roundings of each state's share, whatever the sizes of the rates. A larger chain is stepped (`_stepped`).
 
     Raises
     ------

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from tailgate.base.errors import NotApplicable
 from tailgate.envs.manoeuvres import Braking, Constant, OrnsteinUhlenbeck, Pulse, Sine, StopAndGo, Switched
 
 
-def accelerations(manoeuvre: Any) -> tuple[float, float]:
+def accelerations(manoeuvre: object) -> tuple[float, float]:
     """Return the smallest and the largest acceleration of a leader [m/s^2]; 0 lies between them, as a leader may halt.
 
     Raises
@@ -30,5 +28,6 @@ def accelerations(manoeuvre: Any) -> tuple[float, float]:
         case Constant() | Pulse():
             found = (manoeuvre.value, manoeuvre.value)
         case _:
-            raise NotApplicable("--prove: manoeuvre", type(manoeuvre).__name__, "one that bounds its acceleration; --lead-accel says other bounds")
+            wanted = "one that bounds its acceleration; --lead-accel says other bounds"
+            raise NotApplicable("--prove: manoeuvre", type(manoeuvre).__name__, wanted)
     return min(float(found[0]), 0.0), max(float(found[1]), 0.0)

@@ -57,7 +57,8 @@ def reacting(place: Scenario) -> SafeDistance:
     if place.truth:
         raise NotApplicable("--prove: truth", dict(place.truth), "none: the invariant is about the vehicle that is known")
     if isinstance(place.plant, Highway):
-        raise NotApplicable("--prove: plant", type(place.plant).__name__, "one without traffic: cars cut in here, and the invariant has no such leader")
+        wanted = "one without traffic: cars cut in here, and the invariant has no such leader"
+        raise NotApplicable("--prove: plant", type(place.plant).__name__, wanted)
     model, law = place.brief().model, place.controller
     low, high, tau = getattr(law, "accel_min", None), getattr(law, "accel_max", None), getattr(place.plant, "tau", None)
     if model.lane or not model.followers.any() or low is None or high is None or tau is None:
