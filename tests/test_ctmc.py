@@ -106,6 +106,36 @@ def test_drawn_architectures_against_dense_matrices(seed):
     assert long_run(one, chain, "m") == pytest.approx(wanted[hit[code]].sum(), abs=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("slow", "fast"), [((1e-9, 1e-9), (1e5, 1e5)), ((1.0, 1e-9), (1e6, 1.0)), ((1e-4, 1e-4), (1e-2, 1e3)), ((1e-12, 3e-12), (1e7, 2e7)), ((5.0, 0.0), (1e8, 1.0))],
+)  # fmt: skip
+def test_rates_of_different_sizes(slow, fast):
+    """Entries do not know of each other, so each has its own share; a linked node is slowed by the part of time that it can be reached."""
+    one = made([node("a", *slow, entry=True), node("b", *fast, entry=True)], through=["a"], within=1e-4)
+    report = solve(one)
+    for name, (exploit, patch) in (("a", slow), ("b", fast)):
+        assert report["nodes"][name] == pytest.approx(exploit / (exploit + patch), rel=1e-13)
+    linked = made([node("a", *slow, entry=True), node("b", *fast)], [("a", "b")], through=["b"], within=1e-4)
+    (e, p), (f, q) = slow, fast
+    # by hand: b holds where it was exploited while a was, and is patched either way; balance of b given a on and a off
+    both = e / (e + p) * f * (e + q) / ((e + q) * (f + q) + p * q)
+    alone = both * p / (e + q)
+    assert solve(linked)["messages"]["m"] == pytest.approx(both + alone, rel=1e-12)
+
+
+def test_a_chain_that_is_stepped_lies_between_its_ends(monkeypatch):
+    """The same shares as by elimination; with rates of different sizes it is refused, and says of which field."""
+    one = drawn(np.random.default_rng(7), 7)
+    chain = chain_of(one)
+    exact = lasting(chain)
+    monkeypatch.setattr(ctmc, "DENSE", 1)
+    assert np.abs(lasting(chain) - exact).sum() < 1e-9
+    monkeypatch.setattr(ctmc, "LONGEST", 2000)
+    apart = chain_of(made([node("a", 1e-9, 1e-9, True), node("b", 1e5, 1e5, True)]))
+    with pytest.raises(NotApplicable, match=r"nodes: exploit, patch: got 100000.*one size"):
+        lasting(apart)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_the_automata_are_the_same_process(seed):
     """Shares of simulated runs hold the solved probability, each in an interval of 99.9 %."""
@@ -209,7 +239,7 @@ GOOD = {"kind": "ctmc", "nodes": [node("a", 1.0, 1.0, True), node("b", 1.0)], "l
         ({"nodes": [node("a", -1.0, entry=True)]}, r"node 1.*exploit"), ({"messages": [{"name": "m", "through": []}]}, "at least one node"),
         ({"messages": [{"name": "m", "through": ["x"]}]}, r"message m.through.*'x'"), ({"queries": [{"name": "q", "message": "z", "within": 1.0}]}, r"message.*'z'"),
         ({"queries": [{"name": "q", "message": "m", "within": 0.0}]}, "within"), ({"nodes": [node("1a", 1.0, entry=True)]}, "a letter"),
-        ({"nodes": "a"}, "a list of mappings"), ({"speed": 1}, "speed"),
+        ({"unit": "year\nendmodule"}, r"unit.*one line"), ({"name": "a\rb"}, r"name.*one line"), ({"nodes": "a"}, "a list of mappings"), ({"speed": 1}, "speed"),
     ],
 )  # fmt: skip
 def test_a_file_that_does_not_fit_is_refused(tmp_path, change, words):

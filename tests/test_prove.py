@@ -14,9 +14,10 @@ from tailgate.core.registry import Spec, make
 from tailgate.core.scenario import load_scenario
 from tailgate.play.trace import rollout
 from tailgate.trust.affine import AffineLoop, Step, affine_loop, probed
+from tailgate.trust.leaders import accelerations
 from tailgate.trust.prove import admissible, closed_form, keeps, message_delay, prove, reacting
 from tailgate.trust.signals import SafeDistance
-from tailgate.trust.tube import Tube
+from tailgate.trust.tube import Tube, quantile_of
 
 RUNS, STEPS = 10_000, 150
 LANE, CAR, NETWORK = "lane-keeping-v0", "gusty-stop-and-go-v0", "linear-stealth-v0"
@@ -155,6 +156,28 @@ def test_ten_thousand_runs_behind_a_leader_stay_inside_of_the_tube():
     assert kept == 1.0 and used > 0.1
 
 
+@pytest.mark.parametrize("noise", [None, "uniform"])
+def test_ten_thousand_runs_stay_inside_of_the_gaussian_tube_whatever_the_law_of_the_sensor(noise):
+    """With a probability of 99 %; the deviation of the error is the one that the tube has."""
+    place = car()
+    place = dataclasses.replace(place, sensor=dataclasses.replace(place.sensor, noise=noise))
+    trace, tube = play(place), Tube(affine_loop(place), alpha=0.01)
+    error = (trace.estimate - trace.truth)[:, :, 0]
+    kept = np.abs(error - tube.error.centre[:, None]) <= tube.wide["error"][:, None]
+    assert kept.all(axis=(0, 2)).mean() > 0.99
+    assert np.allclose(error.std(axis=1), np.sqrt(tube.error.variance), rtol=0.06)
+
+
+def test_the_quantile_of_uniform_noise_covers_sums_of_it():
+    rng = np.random.default_rng(3)
+    for many in (1, 2, 5):
+        weights = rng.uniform(0.2, 1.0, (many, 1))
+        total = (weights * 3.0**0.5 * rng.uniform(-1.0, 1.0, (many, 200_000))).sum(axis=0) / np.sqrt((weights**2).sum())
+        for tail in (0.3, 0.1, 0.01, 1e-3):
+            assert (total > quantile_of(tail, True)).mean() <= tail
+    assert quantile_of(0.025, False) == pytest.approx(1.95996, abs=1e-5)
+
+
 def test_the_variance_is_that_of_the_loop():
     place = dataclasses.replace(lane(budget=0), manoeuvre=make("manoeuvre", "bend", value=0.0))
     trace, tube = play(place, runs=4000), Tube(affine_loop(lane(budget=0)), alpha=0.01)
@@ -226,9 +249,21 @@ def test_a_late_message_is_worse_only_if_it_is_led_on():
         stale: [Tube(affine_loop(place, at_rest=True, lead=(-0.5, 0.5), delay=d, stale=stale)).under(0.0).gap for d in (0, 5, 20)] for stale in (True, False)
     }
     assert gaps[True] == sorted(gaps[True]) and gaps[False] == sorted(gaps[False], reverse=True) and gaps[True][0] == gaps[False][0]
-    found = message_delay(dataclasses.replace(place, controller=dataclasses.replace(place.controller, standstill=0.5, headway=1.0)), 0.0, None, at_rest=True, lead=(-0.5, 0.5))
-    kept = [row["delay"] for row in found["tried"] if row["gap"] > 0.0]
-    assert found["largest"] == (kept[-1] if kept else None) and kept == list(range(len(kept)))
+
+
+def test_the_largest_delay_is_the_one_at_which_an_attack_uses_up_the_gap():
+    """An injection that leaves a centimetre at 3 steps of delay takes it at 4; one that takes all without a delay leaves no delay."""
+    rest = {"at_rest": True, "lead": (-0.5, 0.5)}
+    place = car(targets=("position",))
+    place = dataclasses.replace(place, controller=dataclasses.replace(place.controller, standstill=2.0, headway=0.5))
+    tubes = [Tube(affine_loop(place, delay=delay, **rest)) for delay in range(5)]
+    step = int(np.argmin(tubes[3].lower_gap(0.0)))
+    size = (tubes[3].lower_gap(0.0)[step] - 0.01) / tubes[3].pushed["gap"][step, 0]
+    gaps = [tube.lower_gap(size).min() for tube in tubes]
+    assert gaps == sorted(gaps, reverse=True) and gaps[3] == pytest.approx(0.01, abs=1e-6) and gaps[4] < -0.01
+    found = message_delay(place, size, None, **rest)
+    assert found["largest"] == 3 and [row["delay"] for row in found["tried"]] == [0, 1, 2, 3, 4]
+    assert message_delay(place, 2.0 * size, None, **rest)["largest"] is None
 
 
 def test_what_is_not_linear_is_refused():
@@ -242,11 +277,98 @@ def test_what_is_not_linear_is_refused():
         affine_loop(lane(targets=("curvature",)))
     with pytest.raises(InputError, match=r"--bound.*error that counts"):
         affine_loop(load_scenario(NETWORK))
-    for words, options in {"--spread.*0": {"spread": 0.0}, "--delay.*-1": {"delay": -1}, "--lead-accel.*smaller first": {"lead": (1.0, 0.0)}}.items():
+    for words, options in {"--spread.*0": {"spread": 0.0}, "delay.*-1": {"delay": -1}, "--lead-accel.*smaller first": {"lead": (1.0, 0.0)}}.items():
         with pytest.raises(InputError, match=words):
             affine_loop(car(), **options)
-    with pytest.raises(InputError, match=r"--alpha.*1.5"):
+    with pytest.raises(InputError, match=r"--gaussian.*1.5"):
         Tube(affine_loop(car()), alpha=1.5)
+
+
+@pytest.mark.parametrize("name", ["radar-following-v0", "radar-braking-v0", "radar-fast-attacker-v0", "thesis-ch3-v0", "thesis-ch3-switched-v0"])
+def test_a_controller_that_reads_its_own_sensors_is_refused_before_it_is_probed(name):
+    report = prove(name, set_speed=False, delays=True)
+    assert report["attack"] is None and "RadarFollowing" in report["why"]["attack"] and "leader that sends" in report["why"]["delay"]
+
+
+@pytest.mark.parametrize("name", ["car-following-heavy-v0", "car-following-late-v0", "car-following-lossy-v0", "platoon-heavy-v0"])
+def test_the_closed_form_is_refused_where_the_real_vehicle_is_another(name):
+    with pytest.raises(NotApplicable, match=r"truth.*known"):
+        reacting(load_scenario(name))
+
+
+def test_the_closed_form_needs_a_bound_on_how_the_car_ahead_brakes():
+    with pytest.raises(NotApplicable, match=r"plant.*Highway.*cut in"):
+        reacting(load_scenario("highway-v0"))
+    place = load_scenario(CAR)
+    with pytest.raises(NotApplicable, match=r"manoeuvre.*Profile.*bounds its acceleration"):
+        reacting(dataclasses.replace(place, manoeuvre=make("manoeuvre", "profile")))
+    hard = dataclasses.replace(place, manoeuvre=dataclasses.replace(place.manoeuvre, decel=7.5))
+    assert reacting(hard).lead_brake == 7.5
+
+
+@pytest.mark.parametrize(
+    ("manoeuvre", "wanted"),
+    [("braking", (-4.0, 0.0)), ("stop_and_go", (-3.0, 1.5)), ("ornstein_uhlenbeck", (-3.0, 3.0)), ("sine", (-0.5, 0.5)), ("switched", (-0.1082, 0.012)),
+     ("constant", (-0.108, 0.0)), ("pulse", (0.0, 0.3))],
+)  # fmt: skip
+def test_a_leader_stays_within_his_accelerations(manoeuvre, wanted):
+    """As it says, and as it is played."""
+    one = make("manoeuvre", manoeuvre)
+    assert accelerations(one) == wanted
+    place = dataclasses.replace(load_scenario(CAR), manoeuvre=one, horizon=600)
+    speed = play(place, runs=20).lead_speed[..., 0]
+    pull = np.diff(speed, axis=0) / place.plant.dt
+    assert pull.min() >= wanted[0] - 1e-6 and pull.max() <= wanted[1] + 1e-6
+
+
+def test_a_leader_that_brakes_once_is_in_the_loop():
+    for name in ("braking-v0", "braking-fine-v0"):
+        report = prove(name, set_speed=False, steps=20)
+        assert report["attack"] is not None and not report["why"]
+
+
+def test_delays_of_nobody_leave_the_rest_of_the_report():
+    for name, options in ((LANE, {"alpha": 0.001, "at_rest": True}), (NETWORK, {"bound": 30.0})):
+        report = prove(name, delays=True, steps=40, **options)
+        assert report["attack"] is not None and report["delay"] is None and "leader that sends" in report["why"]["delay"]
+
+
+def test_an_authenticated_wire_takes_no_injection():
+    threat = {"targets": ["lane_offset", "lane_heading"], "budget": 20}
+    sealed, one = (prove(LANE, alpha=0.001, at_rest=True, steps=60, threat=threat | more)["attack"] for more in ({"authenticated": ["lane_offset"]}, {"targets": ["lane_heading"]}))
+    assert sealed == one and sealed["targets"] == ["lane_heading"]
+    none = prove(LANE, alpha=0.001, at_rest=True, steps=60, threat={"targets": ["lane_offset"], "authenticated": ["lane_offset"]})["attack"]
+    assert none["targets"] == [] and none["largest"] == none["most"]
+
+
+@pytest.mark.parametrize("bound", [float("nan"), float("inf"), -3.0, 0.0])
+def test_a_bound_is_a_finite_number_above_zero(bound):
+    with pytest.raises(InputError, match=r"--bound.*finite number above 0"):
+        prove(NETWORK, bound=bound)
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--prove", "--defence", "chi2_kf"], "--defence"), (["--prove", "--attack", "none"], "--attack"), (["--prove", "--suite", "lane-v0"], "--suite"),
+        (["--prove", "--runs", "5"], "--runs"), (["--prove", "--out", "x"], "--out"), (["--prove", "--alpha", "0.01"], "--alpha"), (["--prove", "--dose", "5", "--dose", "20"], "--dose"),
+        (["--prove", "--automata", "telematics"], "--automata"), (["--prism", "x.prism"], "--prism"), (["--bound", "3"], "--bound"), (["--delays"], "--delays"),
+        (["--automata", "telematics", "--at-rest"], "--at-rest"), (["--automata", "telematics", "--out", "x"], "--out"),
+        (["--prove", "--property", "gap > 2"], "--property"), (["--prove", "--gaussian", "1.5"], "--gaussian"), (["--prove", "--bound", "nan", "--json"], "--bound"),
+    ],
+)  # fmt: skip
+def test_an_option_that_is_not_read_is_refused(words, named, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    scenario = [] if "telematics" in words and "--prove" not in words else ["--scenario", LANE]
+    assert cli.main(["trust", *scenario, *words]) == 2
+    assert f"{named}:" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("words", [["--gaussian", "0.001", "--at-rest", "--delays", "--steps", "40"], ["--spread", "3", "--steps", "40"]])
+def test_the_printed_table(words, capsys):
+    assert cli.main(["trust", "--prove", "--scenario", LANE, *words]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert ("all ranges together with 0.999" if "--gaussian" in words else "noise within 3 sd") in text and "no closed form: " in text
 
 
 def test_a_controller_is_read_off_exactly():

@@ -131,6 +131,27 @@ def test_the_best_set_is_the_best_of_all(tmp_path, monkeypatch):
     assert any(not row["schedulable"] for row in report["sets"])
 
 
+def test_a_set_that_collides_or_is_too_late_is_no_candidate(monkeypatch):
+    """Whatever its gap: at the longer period each set has the better figure and one collision in a hundred."""
+    monkeypatch.setattr(timing_budget, "control_cost", lambda budget, h, steps: Cost(h, steps, 10.0 + h, 1.0, 0.01 if h > 0.15 else 0.0))
+    report = choices(load_budget("platoon-v2v"))
+    assert report["best"]["period"] == 0.1 and report["best"]["why"] is None
+    assert {row["why"] for row in report["sets"] if row["period"] == 0.2} == {"collides"}
+    assert choices(dataclasses.replace(load_budget("platoon-v2v"), level=4.0))["best"] is None
+    slow = dataclasses.replace(load_budget("platoon-v2v"), slot=timing_budget.Slot(50.0, 512))
+    monkeypatch.setattr(timing_budget, "control_cost", lambda *_: pytest.fail("a delay beyond the episode is played"))
+    report = choices(slow)
+    assert report["best"] is None and {row["why"] for row in report["sets"]} == {"too late to be measured", "misses a deadline"}
+
+
+def test_a_loop_in_which_all_collide_is_not_recommended():
+    """Played: three seconds of delay."""
+    budget = load_budget("platoon-v2v")
+    late = dataclasses.replace(budget, seeds=4, periods=(0.2,), level=0.0, messages=budget.messages[:1], slot=timing_budget.Slot(3.0, 512))
+    report = choices(late)
+    assert report["best"] is None and all(row["cost"]["crashed"] == 1.0 and row["why"] == "collides" for row in report["sets"])
+
+
 def played_in(attack, defence="kf", scenario=V2V, **threat):
     guard = Spec("defence", defence)
     place = load_scenario(scenario).with_threat(**threat)
@@ -190,7 +211,9 @@ def test_a_threat_model_without_tags_leaves_no_mark():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"tasks": []}, r"tasks: got \[\].*at least one"), ({"path": ["four"]}, "path.*'four'.*three"), ({"path": []}, "path.*from the arrival"),
+        ({"tasks": []}, r"tasks: got \[\].*at least one"), ({"path": ["four"]}, "path.*'four'.*three"), ({"path": []}, "path.*from the arrival"), ({"path": ["two", "two"]}, r"path.*\['two', 'two'\].*each task once"),
+        ({"periods": [100.0]}, r"periods.*100.*0.003 to 6 s.*60 s"), ({"periods": [1e-6]}, r"periods.*1e-06.*0.003"), ({"periods": [0.1] * 17}, "periods.*17.*16"),
+        ({"tasks": [*TEXT["tasks"][:2], {"name": "three", "period": 1e6, "wcet": 3}]}, r"period.*1000000.*10000 times"),
         ({"messages": [TEXT["messages"][0] | {"sender": "x"}]}, "leader_position.sender.*'x'"),
         ({"messages": [TEXT["messages"][0] | {"name": "radar"}]}, "message.*'radar'.*leader_position"),
         ({"messages": TEXT["messages"][:1] * 2}, "no two are equal"), ({"level": 9}, r"level.*9.*\(3\)"),

@@ -7,7 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from tailgate.base.errors import InputError
+from tailgate.cli.prove import refuse
 from tailgate.cli.shared import show, table, tell
+
+_PLAYED = (
+    "suite", "defence", "attack", "scenario", "dose", "threat", "property", "precision", "unsafe", "demand", "width", "test", "beacon",
+    "out", "alpha", "confidence", "indifference",
+)  # options of trust that a chain does not read
 
 
 def add_automata(command: argparse.ArgumentParser) -> None:
@@ -22,6 +28,7 @@ def run_automata(options: argparse.Namespace) -> int:
     from tailgate.trust.ctmc import load_architecture, play, solve
     from tailgate.trust.prism import write_prism
 
+    refuse(options, _PLAYED, "--automata")
     made = load_architecture(options.automata)
     if options.prism is not None:
         if Path(options.prism).suffix == ".props":

@@ -13,7 +13,7 @@ def add(commands: Commands) -> None:
     command = commands.add_parser(
         "cost", help="what authenticated messages cost: schedulability, delay, control",
         description="Of a system of tasks and messages, say for every set of authenticated messages if all deadlines are met, how late a "
-        "command is, and what that delay costs the closed loop. docs/scoring.md is about attacks; docs/security-cost.md about this.",
+        "command is, and what that delay costs the closed loop. docs/attacks.md is about attacks; docs/security-cost.md about this.",
     )  # fmt: skip
     command.add_argument("--security", required=True, metavar="NAME", help="system by name or YAML file, such as platoon-v2v")
     command.add_argument("--level", type=float, metavar="W", help="security level that is asked for, instead of the file's")
@@ -44,17 +44,17 @@ def _print(report: dict[str, Any]) -> None:
     for row in report["sets"]:
         names, load = ", ".join(row["authenticated"]) or "none", f"{100 * max(row['load'].values()):.0f} %"
         head = (f"{row['period']:g}", f"{row['level']:g}", names, load)
-        if not row["schedulable"]:
-            rows.append((*head, "misses a deadline", "-", "-", "-"))
-            continue
         cost = row["cost"]
+        if cost is None:
+            rows.append((*head, row["why"], "-", "-", "-"))
+            continue
         figures = f"{cost['min_gap']:.2f}", f"{cost['rmse_position']:.3f}", f"{100 * cost['crashed']:.0f} %"
         rows.append((*head, f"{1000 * row['delay']:.0f} ({row['latency']} steps)", *figures))
     columns = ("period [s]", "level", "authenticated", "largest load", "delay [ms]", "smallest gap [m]", "error [m]", "collisions")
     table(columns, rows, f"{report['name']}: {report['scenario']}, {report['defence']}, {report['seeds']} episodes, medians")
     best = report["best"]
     if best is None:
-        say(f"no set of level {report['asked']:g} meets its deadlines")
+        say(f"no set of level {report['asked']:g} meets its deadlines in time and without a collision")
         return
     names = ", ".join(best["authenticated"]) or "none"
     say(f"best of level {report['asked']:g}: authenticate {names} at a period of {best['period']:g} s")

@@ -3,11 +3,29 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from typing import Any
 
 from tailgate.base.errors import InputError
 from tailgate.cli.shared import counted, say, show, table, values, working
 from tailgate.core.schema import scalar
+
+_PLAYED = (
+    "suite", "attack", "property", "runs", "precision", "unsafe", "demand", "width", "test", "beacon", "out", "alpha", "confidence",
+    "indifference",
+)  # options of trust that a proof does not read
+_PROOFS = {
+    "bound": None, "at_rest": False, "spread": 4.0, "gaussian": None, "lead_accel": None, "no_set_speed": False, "delays": False,
+    "stale": False, "steps": None,
+}  # options of proofs, and what they are if nobody gives them
+_UNSAID = _PROOFS | {"alpha": 0.05, "confidence": 0.99, "indifference": 0.05}
+
+
+def refuse(options: argparse.Namespace, names: Iterable[str], by: str) -> None:
+    """Raise InputError for the first of these options that is given, as `by` does not read it."""
+    for name in names:
+        if (value := getattr(options, name)) not in (_UNSAID.get(name), None, [], ""):
+            raise InputError(f"--{name.replace('_', '-')}", value, f"nothing: {by} does not read it")
 
 
 def add_prove(command: argparse.ArgumentParser) -> None:
@@ -16,7 +34,8 @@ def add_prove(command: argparse.ArgumentParser) -> None:
     group.add_argument("--prove", action="store_true", help="what is proved of a scenario under kf: reachable sets and a closed form")
     group.add_argument("--bound", type=float, metavar="E", help="size of an error that counts as damage, where nobody drives")
     group.add_argument("--at-rest", action="store_true", help="the loop has settled before the first step")
-    group.add_argument("--spread", type=float, default=4.0, metavar="S", help="largest noise, in standard deviations (default 4)")
+    spread = _PROOFS["spread"]
+    group.add_argument("--spread", type=float, default=spread, metavar="S", help="largest noise, in standard deviations (default 4)")
     group.add_argument("--gaussian", type=float, metavar="A", help="Gaussian noise instead, and all ranges hold together with 1 - A")
     group.add_argument("--lead-accel", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of the leader's acceleration [m/s^2]")
     group.add_argument("--no-set-speed", action="store_true", help="take the set speed away, which makes the cruise control linear")
@@ -25,10 +44,20 @@ def add_prove(command: argparse.ArgumentParser) -> None:
     group.add_argument("--steps", type=int, metavar="N", help="first steps of an episode alone")
 
 
+def refuse_proofs(options: argparse.Namespace, by: str) -> None:
+    """Raise InputError for an option of proofs that is given without --prove."""
+    refuse(options, _PROOFS, by)
+
+
 def run_prove(options: argparse.Namespace) -> int:
     """Print what is proved of the scenarios; 1 where a scenario has no part that applies."""
     from tailgate.trust.prove import prove
 
+    refuse(options, ["automata", "prism", *_PLAYED], "--prove")
+    if options.defence not in (None, ["kf"]):
+        raise InputError("--defence", options.defence, "kf alone: another filter or a gate is not what is proved")
+    if options.dose is not None and len(options.dose) > 1:
+        raise InputError("--dose", options.dose, "one dose: a proof is about one budget")
     if not options.scenario:
         raise InputError("--scenario", None, "a scenario to prove something of")
     if options.steps is not None and options.steps < 1:
@@ -66,9 +95,8 @@ def _print(found: list[dict[str, Any]]) -> None:
             table(columns, rows, f"{report['scenario']}: a car that reacts late", told, numbers={0, 1, 2, 3})
         if (held := report["attack"]) is not None:
             noise = held["noise"]
-            words = f"noise within {noise['spread']:g} sd"
-            if "alpha" in noise:
-                words = f"Gaussian noise, all ranges together with {1.0 - noise['alpha']:g}"
+            within = "alpha" not in noise
+            words = f"noise within {noise['spread']:g} sd" if within else f"random noise, all ranges together with {1.0 - noise['alpha']:g}"
             budget = "unlimited" if held["budget"] is None else str(held["budget"])
             sizes = (_number(held[name], held["most"]) for name in ("largest", "without_limits"))
             line = (", ".join(held["targets"]), budget, *sizes, f"{held['calm']['gap']:.4g}")

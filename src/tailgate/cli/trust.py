@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from tailgate.base.errors import InputError
 from tailgate.base.files import aside
 from tailgate.cli.automata import add_automata, run_automata
-from tailgate.cli.prove import add_prove, run_prove
+from tailgate.cli.prove import add_prove, refuse, refuse_proofs, run_prove
 from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, tell, values, working
 from tailgate.core.schema import scalar
 
@@ -96,10 +96,12 @@ def _trust(options: argparse.Namespace) -> int:
     from tailgate.trust.signals import SafeDistance
     from tailgate.trust.statistics import runs_for
 
-    if options.automata is not None:
-        return run_automata(options)
     if options.prove:
         return run_prove(options)
+    refuse_proofs(options, "a command without --prove")
+    if options.automata is not None:
+        return run_automata(options)
+    refuse(options, ["prism"], "a command without --automata")
     own_classes()
     suite, rule = _suite(options), _rule(options)
     runs = runs_for(options.precision, options.confidence) if options.precision is not None else options.runs

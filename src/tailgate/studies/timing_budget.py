@@ -28,6 +28,10 @@ from tailgate.play.trace import rollout
 
 FORMAT = "tailgate-security-cost-1"
 MOST = 14  # messages of which every set is tried
+PERIODS = 16  # control periods that are tried at most
+LATEST = 40  # steps of delay that are measured; the closed loop is as slow as they are many
+SHORTEST, LONGEST = 10, 20_000  # steps of an episode at a period that is tried
+APART = 1e4  # how often the shortest period of a task may fit into the longest
 EDGE = 1e-9  # share by which a time may pass its limit: sums of decimal numbers
 Tell = Callable[[int, int], None]
 Bits = Annotated[int, Field(ge=0, le=10**6)]
@@ -121,16 +125,35 @@ def _check(budget: Budget, where: str) -> None:
     for name in budget.path:
         if name not in names:
             raise unknown(f"{where}.path", name, names)
+    if len(set(budget.path)) < len(budget.path):
+        raise InputError(f"{where}.path", list(budget.path), "each task once")
     if not budget.path:
         raise InputError(f"{where}.path", [], "the tasks from the arrival of a message to the command")
     if len(budget.messages) > MOST:
         raise InputError(f"{where}.messages", len(budget.messages), f"at most {MOST}: every set of them is tried")
-    model = load_scenario(budget.scenario).brief().model
+    place = load_scenario(budget.scenario)
+    _check_periods(budget, place, where)
+    model = place.brief().model
     for message in budget.messages:
         if message.name not in model.wires:
             raise unknown(f"{where}: message", message.name, model.wires)
     if budget.level > sum(message.weight for message in budget.messages):
         raise InputError(f"{where}.level", budget.level, f"at most the sum of all weights ({sum(m.weight for m in budget.messages):g})")
+
+
+def _check_periods(budget: Budget, place: Scenario, where: str) -> None:
+    """Raise InputError for periods in which an episode has too few or too many steps, or that are too far apart."""
+    seconds = place.horizon * place.plant.dt
+    if len(budget.periods) > PERIODS:
+        raise InputError(f"{where}.periods", len(budget.periods), f"at most {PERIODS} periods")
+    for period in budget.periods:
+        low, high = seconds / LONGEST, seconds / SHORTEST
+        if not low <= period <= high:
+            wanted = f"{low:g} to {high:g} s: an episode of {place.name} lasts {seconds:g} s, and has {SHORTEST} to {LONGEST} steps"
+            raise InputError(f"{where}.periods", period, wanted)
+    every = [*(task.period for task in budget.tasks), *budget.periods]
+    if max(every) > APART * min(every):
+        raise InputError(f"{where}.tasks: period", max(every), f"at most {APART:g} times the shortest, {min(every):g}")
 
 
 def responses(tasks: Sequence[tuple[float, float]]) -> list[float | None]:
@@ -251,14 +274,16 @@ def choices(budget: Budget, tell: Tell | None = None) -> dict[str, Any]:
     """Return the report: every set of authenticated messages at every period, its times, its control cost, and the best one."""
     names = [message.name for message in budget.messages]
     weight = {message.name: message.weight for message in budget.messages}
-    periods = budget.periods or (load_scenario(budget.scenario).plant.dt,)
+    place = load_scenario(budget.scenario)
+    periods = budget.periods or (place.plant.dt,)
     sets = [frozenset(some) for size in range(len(names) + 1) for some in combinations(names, size)]
     rows: list[tuple[float, frozenset[str], Timing, int | None]] = []
     wanted: set[tuple[float, int]] = set()
     for period in periods:
         for sealed in sets:
             held = timing(budget, sealed, period)
-            steps = None if held.delay is None else math.ceil(held.delay / period - EDGE)
+            latest = min(LATEST, round(place.horizon * place.plant.dt / period) - 1)
+            steps = None if held.delay is None or held.delay > period * latest * (1.0 + EDGE) else math.ceil(held.delay / period - EDGE)
             rows.append((period, sealed, held, steps))
             if steps is not None:
                 wanted.add((period, steps))
@@ -274,14 +299,24 @@ def choices(budget: Budget, tell: Tell | None = None) -> dict[str, Any]:
             "period": period, "authenticated": sorted(sealed), "level": sum(weight[name] for name in sealed), "delay": held.delay,
             "latency": steps, "load": dict(held.load), "responses": dict(held.responses), "schedulable": held.schedulable,
             "cost": None if cost is None else dataclasses.asdict(cost), "J": None if cost is None else value_of(budget, cost),
+            "why": _why_not(held, cost),
         })  # fmt: skip
-    enough = [row for row in out if row["schedulable"] and row["level"] >= budget.level - EDGE]
+    enough = [row for row in out if row["why"] is None and row["level"] >= budget.level - EDGE]
     best = min(enough, key=lambda row: (row["J"], row["period"], -row["level"]), default=None)
     return {
         "format": FORMAT, "name": budget.name, "scenario": budget.scenario, "defence": budget.defence, "metric": budget.metric,
         "seeds": budget.seeds, "asked": budget.level, "sets": out, "best": best,
         "threat": None if best is None else threat_of(budget, best["authenticated"], best["period"]),
     }  # fmt: skip
+
+
+def _why_not(held: Timing, cost: Cost | None) -> str | None:
+    """Return why a set is no candidate; None where it is one."""
+    if not held.schedulable:
+        return "misses a deadline"
+    if cost is None:
+        return "too late to be measured"
+    return "collides" if cost.crashed > 0.0 else None
 
 
 def threat_of(budget: Budget, sealed: Sequence[str], period: float) -> dict[str, Any]:

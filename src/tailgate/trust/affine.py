@@ -19,10 +19,13 @@ import numpy as np
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Estimate, Model
 from tailgate.core.scenario import Scenario
+from tailgate.core.threat import Brief
 from tailgate.envs.controllers.adaptive_cruise import LEADER
 from tailgate.estimators.filters.kalman import steady_state
+from tailgate.trust.leaders import accelerations
 
 SETTLE = 300  # steps before an episode that begins at rest
+UNIFORM = 3.0**0.5  # standard deviations from the middle of a uniform law to its end
 SPREAD = 4.0  # standard deviations of noise that count as its largest value
 FAR = 1e9  # beyond every limit of a controller
 LINEAR = 1e-6  # by how much a controller may differ from its linear form, relative
@@ -71,6 +74,8 @@ class AffineLoop:
     chance: int = 0  # of the bounded inputs, the first that are noise; the others are the leader's or the road's
     begun: int = 0  # of the generators of the start, the first that are noise
     burn: int = 0  # first steps that nobody looks at: the loop settles
+    lengths: tuple[float, ...] = ()  # of each bounded input that is noise, the generator's standard deviations; empty: `spread` of all
+    uniform: bool = False  # the readings' noise is uniform: its generators hold all of it
 
 
 def probed(controller: Any, model: Model) -> Law:
@@ -165,7 +170,8 @@ def outside_of(place: Scenario, model: Model, delay: int, stale: bool, lead: tup
     plant, manoeuvre = place.plant, place.manoeuvre
     if model.lane:
         if delay or lead is not None:
-            raise InputError("--delay, --lead-accel", delay or lead, "none: nobody sends a message in a lane that drives ahead")
+            given = ("--lead-accel", lead) if lead is not None else ("delay", delay)
+            raise InputError(given[0], given[1], "nothing: nobody who drives ahead is in the loop of a lane")
         radius, ease = getattr(manoeuvre, "radius", None), getattr(manoeuvre, "ease", None)
         if radius is None or ease is None:
             raise NotApplicable("--prove: manoeuvre", type(manoeuvre).__name__, "curves")
@@ -181,7 +187,7 @@ def outside_of(place: Scenario, model: Model, delay: int, stale: bool, lead: tup
     if model.v2v[:2] != LEADER or model.agents != 1 or place.truth:
         wanted = "car_following, lane_keeping, or a network of one agent without a controller"
         raise NotApplicable("--prove: plant", type(plant).__name__, wanted)
-    low, high = lead if lead is not None else _accelerations(manoeuvre)
+    low, high = lead if lead is not None else accelerations(manoeuvre)
     dt, many = model.dt, 2 * (1 + delay)
     Z, E, z0 = np.zeros((many, many)), np.zeros((many, 1)), np.zeros(many)
     Z[0, :2], Z[1, 1] = (1.0, dt), 1.0
@@ -198,15 +204,9 @@ def outside_of(place: Scenario, model: Model, delay: int, stale: bool, lead: tup
     return Outside(Z, E, z0, start, heard, np.zeros((0, many)), ((np.array(model.gap)[0], ahead, 0.0),))
 
 
-def _accelerations(manoeuvre: Any) -> tuple[float, float]:
-    """Return the smallest and the largest acceleration of a leader [m/s^2]."""
-    for low, high in (("decel", "accel_rate"), ("limit", "limit"), ("decel", ""), ("value", "value")):
-        if hasattr(manoeuvre, low):
-            least = float(getattr(manoeuvre, low))
-            if low == "value":
-                return min(least, 0.0), max(least, 0.0)
-            return -least, float(getattr(manoeuvre, high)) if high else 0.0
-    raise NotApplicable("--prove: manoeuvre", type(manoeuvre).__name__, "one that bounds its acceleration; --lead-accel says other bounds")
+def injectable(brief: Brief) -> Array:
+    """Return (w,) bool: the wires of agent 0 that false data may be injected on, granted and not authenticated."""
+    return np.asarray(brief.granted[0] & ~brief.sealed)
 
 
 def affine_loop(
@@ -239,19 +239,19 @@ def affine_loop(
     if not 0.0 < spread <= 100.0:
         raise InputError("--spread", spread, "standard deviations, above 0 and at most 100")
     if not 0 <= delay <= 100:
-        raise InputError("--delay", delay, "steps, 0 to 100")
-    if lead is not None and not lead[0] <= lead[1]:
-        raise InputError("--lead-accel", list(lead), "two numbers, the smaller first")
+        raise InputError("delay", delay, "steps, 0 to 100")
+    if lead is not None and not -np.inf < lead[0] <= lead[1] < np.inf:
+        raise InputError("--lead-accel", list(lead), "two finite numbers, the smaller first")
     brief = place.brief()
     model, threat = brief.model, brief.threat
     if model.agents != 1 or place.truth:
         raise NotApplicable("--prove: scenario", place.name, "one agent, whose vehicle is the one that is known")
-    granted = brief.granted[0]
+    granted = injectable(brief)
     q, n, many = len(model.sensors), model.states, place.horizon if steps is None else min(steps, place.horizon)
     if granted[q:].any():
         raise NotApplicable("--prove: threat_model.targets", list(threat.targets), "sensors, not messages or actuators")
+    out = outside_of(place, model, delay, stale, lead, bound)  # first: a controller of another plant may not be asked at all
     law = probed(place.controller, model) if model.actuators else None
-    out = outside_of(place, model, delay, stale, lead, bound)
     first = _start(place, model, spread)
     burn = SETTLE if at_rest else 0
     K = gains(model, first[2], burn + many, at_rest)
@@ -265,7 +265,7 @@ def affine_loop(
     return AffineLoop(
         model, law, made, start, box, rows, speeds, (k >= threat.onset) & (k <= last), budget,
         1.0 / place.manoeuvre.radius[0] if model.lane else 0.0,
-        spread, made[0].N.shape[1] - out.E.shape[1], box.shape[1] - out.E.shape[1], burn,
+        spread, made[0].N.shape[1] - out.E.shape[1], box.shape[1] - out.E.shape[1], burn, *_lengths(place, model, spread),
     )  # fmt: skip
 
 
@@ -276,9 +276,18 @@ def _noise(place: Scenario, model: Model, spread: float) -> tuple[Array, Array]:
     Q = model.Q if not isinstance(told, float) else np.eye(model.states) * told
     other = getattr(sensor, "noise_var", None)
     R = np.eye(len(model.sensors)) * other if isinstance(other, float) else model.R[0]
-    if getattr(sensor, "noise", None) == "uniform":
-        spread = min(spread, 3.0**0.5)
-    return _box(Q, spread), _box(R, spread)
+    return _box(Q, spread), _box(R, UNIFORM if _uniform(place) else spread)
+
+
+def _uniform(place: Scenario) -> bool:
+    return getattr(place.sensor, "noise", None) == "uniform"
+
+
+def _lengths(place: Scenario, model: Model, spread: float) -> tuple[tuple[float, ...], bool]:
+    """Return how many standard deviations each generator of `_noise` is long, and if the readings' noise is uniform."""
+    process, readings = _noise(place, model, spread)
+    uniform = _uniform(place)
+    return (spread,) * process.shape[1] + (UNIFORM if uniform else spread,) * readings.shape[1], uniform
 
 
 def _box(cov: Array, spread: float) -> Array:

@@ -11,10 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.base.errors import NotApplicable
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array
 from tailgate.core.scenario import Scenario, load_scenario
-from tailgate.trust.affine import affine_loop
+from tailgate.envs.controllers.adaptive_cruise import LEADER
+from tailgate.envs.plants.highway import Highway
+from tailgate.trust.affine import affine_loop, injectable
+from tailgate.trust.leaders import accelerations
 from tailgate.trust.signals import SafeDistance
 from tailgate.trust.tube import Tube
 
@@ -49,15 +52,20 @@ def reacting(place: Scenario) -> SafeDistance:
     Raises
     ------
     NotApplicable
-        Where no car with limits follows another.
+        Where no car with limits follows another, the real vehicle is not the one that is known, or nothing bounds how the car ahead brakes.
     """
+    if place.truth:
+        raise NotApplicable("--prove: truth", dict(place.truth), "none: the invariant is about the vehicle that is known")
+    if isinstance(place.plant, Highway):
+        wanted = "one without traffic: cars cut in here, and the invariant has no such leader"
+        raise NotApplicable("--prove: plant", type(place.plant).__name__, wanted)
     model, law = place.brief().model, place.controller
     low, high, tau = getattr(law, "accel_min", None), getattr(law, "accel_max", None), getattr(place.plant, "tau", None)
     if model.lane or not model.followers.any() or low is None or high is None or tau is None:
         wanted = "a car with a lag and limits of its acceleration that follows another"
         raise NotApplicable("--prove: controller", type(law).__name__, wanted)
-    hardest = getattr(place.manoeuvre, "decel", getattr(place.manoeuvre, "limit", -float(low)))
-    return SafeDistance(model.dt + float(tau), max(float(high), 0.0), -float(low), max(float(hardest), -float(low)))
+    hardest = -accelerations(place.manoeuvre)[0]
+    return SafeDistance(model.dt + float(tau), max(float(high), 0.0), -float(low), max(hardest, -float(low)))
 
 
 def closed_form(place: Scenario, speeds: Sequence[float] = SPEEDS) -> dict[str, Any]:
@@ -79,7 +87,7 @@ def attack_size(place: Scenario, bound: float | None, alpha: float | None, **opt
     tube = Tube(affine_loop(place, bound=bound, **options), bound, alpha)
     most, calm = place.threat_model.fdi_bound, tube.under(0.0)
     return {
-        "targets": [name for name, hit in zip(tube.loop.model.wires, place.brief().granted[0].tolist(), strict=True) if hit],
+        "targets": [name for name, hit in zip(tube.loop.model.wires, injectable(place.brief()).tolist(), strict=True) if hit],
         "budget": place.threat_model.budget, "steps": len(tube.loop.attacked) - tube.loop.burn,
         "noise": {"spread": tube.loop.spread} if alpha is None else {"alpha": alpha},
         "largest": tube.largest(most), "without_limits": tube.largest(most, limits=False), "most": most,
@@ -88,7 +96,15 @@ def attack_size(place: Scenario, bound: float | None, alpha: float | None, **opt
 
 
 def message_delay(place: Scenario, size: float, alpha: float | None, tell: Tell | None = None, **options: Any) -> dict[str, Any]:
-    """Return the largest delay of the leader's message [steps] up to which no gap is lost, every shorter one included."""
+    """Return the largest delay of the leader's message [steps] up to which no gap is lost, every shorter one included.
+
+    Raises
+    ------
+    NotApplicable
+        Where no leader sends messages.
+    """
+    if place.brief().model.v2v[:2] != LEADER:
+        raise NotApplicable("--delays: scenario", place.name, "a leader that sends his position and speed")
     rows: list[dict[str, Any]] = []
     for delay in range(MOST_DELAY + 1):
         if tell is not None:
@@ -120,6 +136,8 @@ def prove(
     options
         Arguments of `affine_loop`.
     """
+    if bound is not None and not 0.0 < bound < np.inf:
+        raise InputError("--bound", bound, "a finite number above 0")
     place = load_scenario(scenario).with_threat(**(threat or {}))
     if not set_speed and getattr(place.controller, "set_speed", None) is not None:
         place = dataclasses.replace(place, controller=dataclasses.replace(place.controller, set_speed=None))

@@ -52,27 +52,38 @@ def extent(loop: AffineLoop, rows: Array, direct: tuple[Array, Array, Array] | N
     carried, attack = np.array(rows), np.zeros((many, r, many))
     centre, noise, variance, other = (np.zeros((many, r)) for _ in range(4))
 
-    def add(at: slice, moved: Array, chance: int) -> None:
+    lengths = np.array(loop.lengths) if loop.lengths else np.full(loop.chance, loop.spread)
+
+    def add(at: slice, moved: Array, chance: int, long: Array | float) -> None:
         noise[at] += np.abs(moved[..., :chance]).sum(axis=2)
-        variance[at] += (moved[..., :chance] ** 2).sum(axis=2) / loop.spread**2
+        variance[at] += ((moved[..., :chance] / long) ** 2).sum(axis=2)
         other[at] += np.abs(moved[..., chance:]).sum(axis=2)
 
     if direct is not None:
         centre += direct[0]
-        add(slice(None), direct[1], loop.chance)
+        add(slice(None), direct[1], loop.chance, lengths)
         for k in np.flatnonzero(loop.attacked[:many]):
             attack[k, :, k] = np.abs(direct[2][k]).sum(axis=1)
     for j in range(many - 2, -1, -1):
         step, later = loop.steps[j], carried[j + 1 :]
         centre[j + 1 :] += later @ step.m0
-        add(slice(j + 1, None), later @ step.N, loop.chance)
+        add(slice(j + 1, None), later @ step.N, loop.chance, lengths)
         if loop.attacked[j]:
             attack[j + 1 :, :, j] = np.abs(later @ step.W).sum(axis=2)
         carried[j + 1 :] = later @ step.M
     centre += carried @ loop.start
-    add(slice(None), carried @ loop.box, loop.begun)
+    add(slice(None), carried @ loop.box, loop.begun, loop.spread)
     wide, seen = 1.0 + ROUND, slice(loop.burn, None)
     return Extent(centre[seen], noise[seen] * wide, variance[seen] * wide * wide, other[seen] * wide, attack[seen] * wide)
+
+
+def quantile_of(tail: float, uniform: bool) -> float:
+    """Return how many standard deviations noise passes, to one side, with a probability of `tail` at most.
+
+    Uniform noise is no wider than Gaussian noise of its variance in its moment generating function, so Chernoff's bound holds for sums:
+    exp(-q^2 / 2).
+    """
+    return float(np.sqrt(2.0 * np.log(1.0 / tail))) if uniform else float(-ndtri(tail))
 
 
 def worst(held: Extent, budget: int) -> Array:
@@ -88,11 +99,14 @@ class Tube:
 
     Without `alpha` every noise lies within the loop's spread, in the worst order. With it the noise is Gaussian. All ranges of all steps
     then hold together with a probability of 1 - alpha at least (Bonferroni). That is so against any attack: its share has a bound.
+    Uniform noise of the readings has its own variance, and the wider quantile of a bound that holds for both laws.
     """
 
     def __init__(self, loop: AffineLoop, bound: float | None = None, alpha: float | None = None) -> None:
         if alpha is not None and not 0.0 < alpha < 1.0:
-            raise InputError("--alpha", alpha, "a number above 0 and below 1")
+            raise InputError("--gaussian", alpha, "a number above 0 and below 1")
+        if bound is not None and not 0.0 < bound < np.inf:
+            raise InputError("--bound", bound, "a finite number above 0")
         self.loop, self.bound, self.alpha, many = loop, bound, alpha, len(loop.steps)
         self.gap = self._constant([row for row, _ in loop.gaps], many)
         self.gap_offset = np.array([offset for _, offset in loop.gaps])
@@ -106,7 +120,7 @@ class Tube:
         found = {name: held for name, held in parts.items() if held is not None}
         self.pushed = {name: worst(held, loop.budget) for name, held in found.items()}
         ends = 2 * sum(held.centre.size for held in found.values())
-        quantile = 0.0 if alpha is None else float(ndtri(1.0 - alpha / ends))
+        quantile = 0.0 if alpha is None else quantile_of(alpha / ends, loop.uniform)
         self.wide = {
             name: held.other + (held.noise if alpha is None else quantile * np.sqrt(held.variance)) for name, held in found.items()
         }  # fmt: skip
