@@ -176,6 +176,7 @@ def test_bad_input_is_exit_code_2_and_one_line(run: Run, tmp_path: Path, argumen
     assert sorted(p.name for p in tmp_path.rglob("*") if "__pycache__" not in p.parts and p.name != "__pycache__") == before
 
 
+@pytest.mark.long
 def test_a_run_is_compared_also_where_nobody_can_look_into_the_defence(run: Run) -> None:
     """The preset's white-box attack needs an innovation, which `none` has not: it is left out, with the reason. `none` is a name here."""
     code, out, said = run(

@@ -49,6 +49,7 @@ def test_a_lost_job_is_given_again(on_ray, tmp_path):
     assert list(each(killed_at_first, [(str(tmp_path), cluster.RETRIES)], 2)) == [(0, cluster.RETRIES)]
 
 
+@pytest.mark.long
 def test_a_job_that_kills_every_worker_costs_itself_only(on_ray, tmp_path):
     (tmp_path / "other").mkdir()
     jobs = [(str(tmp_path), 10_000), (str(tmp_path / "other"), 0)]

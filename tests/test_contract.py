@@ -149,7 +149,7 @@ def test_before_onset_an_attacked_episode_is_the_clean_one(attack, short, play):
     for name in clean.signals:
         if name != "refused":
             np.testing.assert_array_equal(attacked.signals[name][:24], clean.signals[name][:24], err_msg=name)
-    if attack != "none":
+    if attack not in ("none", "zoo"):  # the policy waits for longer than this episode
         assert not np.array_equal(attacked.estimate[24:], clean.estimate[24:])
 
 

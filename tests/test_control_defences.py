@@ -193,6 +193,7 @@ def baseline(clip, y):
     return np.array(out)
 
 
+@pytest.mark.long
 def test_falsified_accelerations_collide_without_the_clip_and_not_with_it():
     """A bias of 10 m/s^2 on the predecessor's acceleration: everybody collides under dkf and lasso_dkf, nobody with the clip."""
     for filter in ("dkf", "lasso"):
@@ -269,6 +270,7 @@ def test_acc_fallback_asks_for_no_messages_while_alarmed():
     assert all(d.accept.all() and d.limits is None for d in out)
 
 
+@pytest.mark.long
 def test_acc_fallback_ignores_the_lie_once_alarmed():
     """With an alarm in every step the falsified messages do nothing; with none they collide."""
 

@@ -80,6 +80,7 @@ def drawn(rng, size):
 
 
 @pytest.mark.parametrize("seed", range(12))
+@pytest.mark.thin(3)
 def test_drawn_architectures_against_dense_matrices(seed):
     """The exponential of the whole generator, built here from the definition, and its null space."""
     rng = np.random.default_rng(seed)

@@ -57,6 +57,7 @@ def _problem(trial):
 
 
 @pytest.mark.parametrize("norm", [2, 1])
+@pytest.mark.thin(2)
 def test_the_decoder_is_as_good_as_an_interior_point_solver(norm):
     """200 random problems, degenerate ones among them: after 2000 rounds the objective is Clarabel's, to 3e-5 where signs all but balance."""
     cp = pytest.importorskip("cvxpy")

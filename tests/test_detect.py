@@ -69,6 +69,7 @@ def test_a_board_without_rows_gets_its_detection(bare: Data, detected: Data) -> 
     assert detected | {"detection": None, "entries": rest} == bare
 
 
+@pytest.mark.long
 def test_a_finished_entry_is_kept_and_an_interrupted_one_costs_only_itself(
     bare: Data, detected: Data, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -148,6 +149,7 @@ def test_a_field_that_was_taken_out_is_found(board: Data, part: str, field: str)
     assert [(line["of"], line["field"], line["board"]) for line in report["findings"]] == [(part, field, None)]
 
 
+@pytest.mark.long
 def test_a_class_of_somebody_s_own_is_played_where_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Only then: without its name it is passed over, as a board runs no code by itself."""
     (tmp_path / "mine_detected.py").write_text("from tailgate.estimators import GatedKalman\nclass Mine(GatedKalman):\n    pass\n", encoding="utf-8")

@@ -256,6 +256,7 @@ def test_policies_are_learned(tmp_path, monkeypatch):
     assert race.episodes(3, 1) == 3 * 128 + 3 * (8 * 16 * 16 + 128) + 2 * (4 * 32 * 16 + 128)
 
 
+@pytest.mark.long
 def test_where_nobody_drives_an_error_is_damage(monkeypatch):
     monkeypatch.setattr(searching, "FINAL", 16)
     place = arena("network")

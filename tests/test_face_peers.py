@@ -74,6 +74,7 @@ def test_a_limit_of_steps_is_that_of_gymnasium(autoreset, engine):
 
 
 @pytest.mark.parametrize("name", FACES)
+@pytest.mark.thin(2)
 def test_the_spec_says_the_horizon(name):
     """`spec.max_episode_steps` is the number of decisions; a spec that is made again ends at the same one."""
     few = {"defence": "dkf"} if name == "tailgate/SensorNetwork-v0" else {}  # its default takes long to compile

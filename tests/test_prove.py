@@ -242,6 +242,7 @@ def test_limits_of_the_command_count():
     assert Tube(affine_loop(place), alpha=1e-3).largest(10.0) is None  # the first readings alone may ask for more than the steering has
 
 
+@pytest.mark.long
 def test_a_late_message_is_worse_only_if_it_is_led_on():
     """A stale position keeps the car farther behind; one that is led on by its speed hides a braking leader."""
     place = car()

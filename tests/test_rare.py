@@ -52,6 +52,7 @@ def _exact(points=1200):
     return out
 
 
+@pytest.mark.long
 def test_a_rare_event_of_a_linear_system_has_its_probability():
     """P is about 1e-6; the interval holds the exact value at a hundredth of the cost of plain episodes."""
     exact = _exact()

@@ -296,7 +296,7 @@ def test_a_network_is_drawn_plain():
     """Nothing drives there: auto draws the graph, and the road is refused with a word."""
     network = made("tailgate/SensorNetwork-v0")
     assert network.render()[0].shape == (render.HEIGHT, render.WIDTH, 3)
-    with pytest.raises(NotApplicable, match="cars on a road"):
+    with pytest.raises(NotApplicable, match="cars that follow each other"):
         made("tailgate/SensorNetwork-v0", viewer="highway").render()
 
 

@@ -108,7 +108,8 @@ def test_the_entries_of_a_published_board_met_every_built_in_attack_that_its_sui
     heads = {text.split(":")[0] for text in met}
     others = [text for text, entry in entries("attack").items() if not (text in heads or entry.optimal or entry.learned)]
     programs = [f"program:path={path.stem}" for path in sorted((ROOT / "configs/attacks").glob("*.yaml"))]
-    others += [text for text in (*programs, *(f"zoo:name={policy}" for policy in zoo_names())) if text not in met]
+    published = [f"zoo:name={policy}" for policy in zoo_names() if name != "quick-v0" or not policy.startswith("car-following-")]
+    others += [text for text in (*programs, *published) if text not in met]  # those of car following play on quick-v0 since decision 54
     briefs = [load_scenario(scenario).with_threat(**suite.granted).brief() for scenario in suite.nominal]
     others = [text for text in others if any(_fits(text, brief) for brief in briefs)]  # a program may aim at wires that are not there
     ranked = [entry["defence"] for entry in board["entries"] if entry["status"] == "ranked"][:1]
@@ -130,8 +131,10 @@ STEERING = {"always_brake", "stand_still", "brake_kf", "widen_kf"}  # in a netwo
 ALONE = {"imm", "chi2_kf", "chi2_kf_sparse", "windowed_chi2_kf", "cusum_kf", "mewma_kf", "reacquire_kf", "cusum_reacquire_kf", "oracle"}  # lost there, as `kf`
 FAILING = {"windowed_chi2_kf", "widen_kf", "brake_kf"}  # in a platoon, a gate: without an attack
 SLOW = {"filterpy_hinfinity"}  # episode by episode
+LATER = {"bernoulli", "minimax", "watermark"}  # built after these suites were fixed; redundant-v0 plays the first two
 
 
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("name", ["quick-v0", "car-following-v0", "platoon-v0", "radar-v0", "network-v0", "thesis-v0", "highway-v0", "lane-v0"])
 def test_a_suite_plays_every_built_in_defence_that_fits(name) -> None:
     """What it leaves out refuses one of its scenarios, is another one under a second name, has nobody to talk to or hours to go, or is lost without an attack."""
@@ -139,7 +142,7 @@ def test_a_suite_plays_every_built_in_defence_that_fits(name) -> None:
         pytest.importorskip("highway_env")
     suite = load_suite(name)
     sizes = {load_scenario(scenario).brief().model.agents for scenario in suite.scenarios}
-    out = ALIKE | SLOW | (TALKING if sizes == {1} else set()) | (STEERING | ALONE if suite.bound is not None else set())
+    out = ALIKE | SLOW | LATER | (TALKING if sizes == {1} else set()) | (STEERING | ALONE if suite.bound is not None else set())
     out |= FAILING if name == "platoon-v0" else set()
     out |= STEERING if name == "lane-v0" else set()  # a mode changes nothing
     listed = {text.split(":")[0] for text in suite.defences}
@@ -150,6 +153,7 @@ def test_a_suite_plays_every_built_in_defence_that_fits(name) -> None:
     assert set(others) == refused
 
 
+@pytest.mark.long
 def test_an_agent_alone_is_lost_in_the_weak_network_whatever_its_filter() -> None:
     """Without an attack, so that no gate can be passed: `kf` on the board says so for all of them."""
     suite = load_suite("network-v0")

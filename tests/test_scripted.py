@@ -352,6 +352,7 @@ def _episode(interval=1, **options):
 
 @pytest.mark.parametrize("interval", [1, 5])
 @pytest.mark.parametrize("reward", ["collision", "min_gap", "error", "stealth"])
+@pytest.mark.thin(2)
 def test_shaping_telescopes(reward, interval):
     """The discounted sum of what shaping adds is gamma^T Phi(end) - Phi(start), Phi(end) = 0 at a collision: no policy gains."""
     total, discount = np.zeros(8), 1.0
@@ -368,6 +369,7 @@ def test_shaping_telescopes(reward, interval):
 
 
 @pytest.mark.parametrize("interval", [1, 5])
+@pytest.mark.thin(2)
 def test_raw_rewards(interval):
     """collision pays 1 at a crash; min_gap also the fall of the smallest gap below 20 m, over 20 m; error and stealth per second."""
     paid = {name: np.zeros(8) for name in ("collision", "min_gap", "error", "stealth")}

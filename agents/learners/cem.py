@@ -303,11 +303,11 @@ def imitation(shape: Shape, shown: Demonstration, rng: np.random.Generator, batc
         slope = _slope(shape, theta, shown.observation[some] / size, shown.action[some])
         first, second = 0.9 * first + 0.1 * slope, 0.999 * second + 0.001 * slope**2
         theta -= IMITATION_RATE * (first / (1.0 - 0.9**t)) / (np.sqrt(second / (1.0 - 0.999**t)) + 1e-8)
+    shape.layers(theta)[0][0][:] /= size[:, None]
     weight, bias = shape.layers(theta)[-1]
     scale = np.sqrt(np.mean(np.concatenate([weight.ravel(), bias]) ** 2))
     weight /= scale
     bias /= scale
-    shape.layers(theta)[0][0][:] /= size[:, None]
     return theta
 
 
