@@ -405,7 +405,7 @@ def test_bad_input_is_refused_before_anything_is_played(arguments: list[str], wo
 
 def test_the_formulas_and_signals_of_the_documentation_are_those_that_are_read(short: str) -> None:
     """Somebody who copies a line of it would get an error, or miss a signal."""
-    text = (Path(__file__).parents[1] / "docs" / "trust.md").read_text(encoding="utf-8").split("## A formula of one's own")[1]
+    text = (Path(__file__).parents[1] / "docs" / "trust.md").read_text(encoding="utf-8").split("## A formula of one's own")[1].split("\n## ")[0]
     lines = [re.split(r"\s{3,}", line.strip())[0] for line in text.splitlines() if line.startswith("    ")]
     assert len(lines) == 5 and len(own(dataclasses.replace(load_scenario(short), horizon=600), lines)) == 5
     named = {name for line in text.splitlines() if line.startswith("| `") for name in re.findall(r"`(\w+)`", line.split("|")[1])}
