@@ -320,7 +320,7 @@ def test_watermark_raises_the_statistic_under_replay():
 
 
 def test_a_watermark_is_a_part_of_the_command_and_known_to_the_filter():
-    """What the actuators get has the variance on top; the clean score is as without; sd = 0 is the plain filter."""
+    """The watermark's variance adds to that of the command; the clean score stays as it is; sd = 0 gives the plain filter."""
     place = load_scenario("stop-and-go-v0").with_threat(kinds=("replay",), knowledge="black")
     plain = tailgate.make_defence("composed", detector="windowed_chi2", mitigation="accept_all")
     known, quiet, loud = (

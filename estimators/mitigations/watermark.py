@@ -28,7 +28,7 @@ from tailgate.estimators.parts import Detector, Filter, Mitigation
 )  # fmt: skip
 @dataclass(frozen=True)
 class Watermark(Composed):
-    """Kalman filter under the windowed chi-square test, which adds noise of its own to the command: a replay does not answer to it."""
+    """Kalman filter under the windowed chi-square test, which adds secret noise to the command: replayed readings do not show it."""
 
     threshold_field: ClassVar[str] = "threshold"
     sd: NonNegative = param(0.3, "standard deviation of what is added to the command [m/s^2]")

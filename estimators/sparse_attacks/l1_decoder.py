@@ -50,7 +50,7 @@ class Windows(NamedTuple):
 
 
 def decoded(held: Windows, rounds: int) -> Array:
-    """Return argmin of the sum of the groups' norms (B, N, n), in at most so many rounds."""
+    """Return the state (B, N, n) that minimises the sum of the groups' norms, after `rounds` rounds at most."""
     gram, floor = grams(held.O, held.there), floor_of(held.O)
     every = np.ones(held.there.shape[:3])
     first = least_squares(held.O, held.Y, gram, every, floor)

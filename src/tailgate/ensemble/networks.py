@@ -104,6 +104,11 @@ class Start(NamedTuple):
     size: Array  # (d,) standard deviation of each observation: the less one varies, the larger are the changes of its weights
     script: str = ""  # that it imitates
 
+    @property
+    def rests(self) -> bool:
+        """If all its weights but a bias are 0."""
+        return not self.script and not self.name.startswith(ZOO)
+
 
 class Evolution:
     """One start: a distribution of weights that moves towards what does more harm."""
@@ -118,7 +123,7 @@ class Evolution:
         reads = [np.ones_like(part) for part in parts]
         reads[0] /= start.size[:, None]
         sizes = [np.sqrt(np.mean((part / read) ** 2)) or 1.0 for part, read in zip(parts, reads, strict=True)]
-        if start.name.startswith("rest"):
+        if start.rests:
             sizes = [1.0] * len(parts)
         self.unit = SPREAD * np.concatenate([(size * read).ravel() for size, read in zip(sizes, reads, strict=True)])
         self.method = SepCMA(np.zeros(self.first.size), 1.0, population_size=population, seed=seed)
