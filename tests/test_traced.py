@@ -29,7 +29,7 @@ from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.envs.gym.gymnasium_env import AdversaryEnv, AdversaryVectorEnv
 from tailgate.envs.gym.programs import SeatPrograms
 from tailgate.estimators import ChiSquare, Kalman
-from tailgate.play import rollouts, trace
+from tailgate.play import commanded, rollouts, trace
 from tailgate.play.commanded import Commanded
 from tailgate.play.rollouts import Rollout, rollout_of
 from tailgate.play.trace import Trace, rollout
@@ -198,6 +198,21 @@ def test_parameters_of_other_values_are_traced_once(monkeypatch):
     shifted = ChiSquare.step
     monkeypatch.setattr(ChiSquare, "step", lambda *arguments: shifted(*arguments))
     assert play("chi2_kf", "fdi:trigger=near,threshold=50,value=3", 20) == before + 3  # other functions
+
+
+@pytest.mark.parametrize("names", [("car-following-noisy-v0", "car-following-late-v0"), ("car-following-lossy-v0", "car-following-noisy-v0")])
+def test_a_state_of_another_form_has_another_program(names, monkeypatch):
+    """A perfect link has no state, and nothing but the state says so to the code of a step."""
+    monkeypatch.setattr(rollouts, "_made", Remembered())
+    monkeypatch.setattr(commanded, "_made", Remembered())
+    keys, attack = draws.keys("report", range(3)), NoAttack()
+    for name in names:
+        loop = load_scenario(name).loop(Spec("defence", "chi2_kf").make())
+        wanted = rollout(loop, attack, keys, plain=True)
+        for made in (rollout_of(loop, attack), commanded.commanded(loop)):
+            played = made.play(keys, True) if isinstance(made, Rollout) else made.play(attack, keys, True)
+            got = Trace(loop.model, loop.horizon, *played, loop.controller.desired_gap)
+            assert [got.trace_hash(i) for i in range(3)] == [wanted.trace_hash(i) for i in range(3)]
 
 
 def test_intervals_share_code_and_not_their_length():

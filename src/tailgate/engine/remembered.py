@@ -1,4 +1,4 @@
-"""Cached programs, found by the key of their parameters and the answers that the code asked for."""
+"""Cached programs, found by the key of their parameters, the form of their state and the answers that the code asked for."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from tailgate.base.pytree import leaves
 from tailgate.engine import objects
 from tailgate.engine.agreement import Untraced, explained
 from tailgate.engine.graph import Graph
@@ -47,7 +48,7 @@ class Answers:
 
 
 class Remembered(Generic[T]):
-    """A cache of programs by the key of their parameters, with several variants per key for other answers."""
+    """A cache of programs by the key of their parameters and the form of their state, with several variants per key for other answers."""
 
     def __init__(self) -> None:
         self._held: dict[Any, list[tuple[Parameters, Answers, T]]] = {}
@@ -62,15 +63,16 @@ class Remembered(Generic[T]):
         Parameters
         ----------
         held : the objects whose parameters the programs use
-        begin : lets the objects compute what they cache, because that is among their parameters
+        begin : returns the first state, and lets the objects compute what they cache, because that is among their parameters
         make : traces and compiles the programs
         adopt : adapts cached programs to other parameter values
         difference : names what differs from the plain loop; empty if nothing does
         """
         try:
-            begin()
+            form = _form(begin())
             parameters = Parameters(held)
-            if found := self._find(parameters):
+            key = None if parameters.key is None else (form, parameters.key)
+            if found := self._find(key, parameters):
                 return adopt(found, parameters.values)
             made = make()
         except Exception as error:  # a plug-in may raise anything when arrays are not numpy's
@@ -80,25 +82,30 @@ class Remembered(Generic[T]):
             if differs := difference(made):
                 return Untraced(f"traced code and the plain loop differ in {differs}")
             objects.prove(names)
-        self._keep(parameters, [program.trace.graph for program in made.programs], made)
+        self._keep(key, parameters, [program.trace.graph for program in made.programs], made)
         return made
 
-    def _find(self, parameters: Parameters) -> T | None:
+    def _find(self, key: object, parameters: Parameters) -> T | None:
         """Return cached programs that fit these parameters."""
         with self._lock:
-            several = self._held.pop(parameters.key, None) if parameters.key is not None else None
+            several = self._held.pop(key, None) if key is not None else None
             if several is None:
                 return None
-            self._held[parameters.key] = several  # now the most recently used
+            self._held[key] = several  # now the most recently used
         return next((made for _, answers, made in several if answers.fit(parameters.values)), None)
 
-    def _keep(self, parameters: Parameters, graphs: Sequence[Graph], made: T) -> None:
+    def _keep(self, key: object, parameters: Parameters, graphs: Sequence[Graph], made: T) -> None:
         """Cache the programs of these parameters, with the answers that their graphs asked for."""
-        if parameters.key is None:
+        if key is None:
             return
         answers = Answers(graphs)
         with self._lock:
-            several = self._held.pop(parameters.key, [])
-            self._held[parameters.key] = [*several[1 - EACH :], (parameters, answers, made)]
+            several = self._held.pop(key, [])
+            self._held[key] = [*several[1 - EACH :], (parameters, answers, made)]
             while len(self._held) > KEPT:
                 del self._held[next(iter(self._held))]
+
+
+def _form(state: object) -> tuple[Any, ...]:
+    """Return the name, the shape of a row and the type of each leaf; code may ask for a leaf instead of a parameter."""
+    return tuple((name, leaf.shape[1:], leaf.dtype.str) for name, leaf in leaves(state).items())

@@ -130,7 +130,7 @@ def commanded(loop: Loop) -> Commanded | Untraced:
     """Return the program of a loop that takes commands, if it equals the plain loop; else the reason why there is none."""
     return _made.proved(
         (loop, device()),
-        lambda: _seen(loop, _first(loop)),
+        lambda: (begun := _first(loop), _seen(loop, begun)),
         lambda: Commanded(loop),
         lambda found, values: found.of(loop, values),
         _difference,

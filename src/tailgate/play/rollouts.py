@@ -109,11 +109,16 @@ def rollout_of(loop: Loop, attack: Attack) -> Rollout | Untraced:
     plan = attack.prepare(loop.brief)
     return _made.proved(
         (loop, attack, plan, device()),
-        lambda: loop.sense(_begun(loop, attack, plan, _ONE).loop),
+        lambda: _sensed(loop, _begun(loop, attack, plan, _ONE)),
         lambda: Rollout(loop, attack, plan),
         lambda found, values: found.of(loop, attack, plan, values),
         _difference,
     )
+
+
+def _sensed(loop: Loop, begun: Episodes) -> Episodes:
+    loop.sense(begun.loop)  # caches what an attacker's view needs
+    return begun
 
 
 def _difference(rollout: Rollout, batch: int = ROWS) -> str:
