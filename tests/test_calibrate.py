@@ -75,6 +75,7 @@ def test_onsets_are_those_of_the_metric(short):
     np.testing.assert_array_equal(onsets[:, 0], (alarm[1:] & ~alarm[:-1]).sum(axis=0) + alarm[0])
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize(("defence", "scenario"), [("chi2_kf", "braking-v0"), ("imm", "stop-and-go-v0"), ("cusum_kf", "radar-braking-v0")])
 def test_the_plain_loop_finds_the_same_threshold(monkeypatch, defence, scenario):
     """To the last digit, with the same alarms in as many steps."""

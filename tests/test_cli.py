@@ -116,6 +116,7 @@ class Mean(Kalman):
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("batch", ["256", pytest.param("1", marks=pytest.mark.long)])
 def test_a_defence_whose_rows_depend_on_one_another_is_warned_of(batch: str, tmp_path: Path) -> None:
     """Its rows are kept, and the exit code is as it was. With one row at a time they do so only when somebody plays more."""

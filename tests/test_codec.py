@@ -354,6 +354,7 @@ def test_error_pays_the_largest_error_of_an_agent(kind):
     np.testing.assert_allclose(Reward(reward="final", error_scale=4.0)(model, frame, fall, last), final)
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize(("scenario", "defence"), [("network-restless-v0", "dkf"), ("platoon-gusty-v0", "dkf"), ("stop-and-go-v0", "kf")])
 def test_the_rises_of_the_peak_add_up_to_the_largest_error(scenario, defence):
     """What `peak` pays for in an episode is `max_error` over error_scale, however many steps a decision lasts."""

@@ -56,7 +56,7 @@ def slow(defence):
 each = pytest.mark.parametrize("defence, place", [(d, p) for p in PLACES for d in DEFENCES])
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(6)
 @each
 def test_a_defence_runs_and_its_rows_do_not_depend_on_their_batch(defence, place):
     """Finite arrays of the declared shapes, and the same trace_hash in batches of 1, 3 and 16, while readings are falsified and lost."""

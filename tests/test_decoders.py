@@ -235,6 +235,7 @@ def test_the_bound_is_reached_by_two_explanations():
     assert bounds.l0_bound(O[:4], D[:4], 2) == np.inf
 
 
+@pytest.mark.long
 def test_the_played_robust_decoder_keeps_its_bound():
     """On the road, under false data on two sensors, with errors inside of D: the position's error is below the bound."""
     place = load_scenario("redundant-two-v0")

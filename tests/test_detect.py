@@ -142,6 +142,7 @@ def test_thresholds_of_other_plants_are_played_again_only_when_asked_for(detecte
     assert len(module._shared(load_suite("network-v0"))) == 2
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize(("part", "field"), [("entries", "watched"), ("alarms", "watched"), ("entries", "delay")])
 def test_a_field_that_was_taken_out_is_found(board: Data, part: str, field: str) -> None:
     next(line for line in board["detection"][part] if line["defence"] == "kf").pop(field)
@@ -200,6 +201,7 @@ def test_a_board_that_has_its_figures_is_left_alone_with_a_word(board: Data, tmp
     assert "the board is as it was" in capsys.readouterr().err and json.loads(path.read_text()) == board
 
 
+@pytest.mark.long
 def test_an_honest_detection_board_comes_out_equal(board: Data) -> None:
     """Figures of fields that a board of before lacks are not asked for."""
     for entry in board["entries"]:

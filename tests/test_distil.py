@@ -124,6 +124,7 @@ def small(monkeypatch):
         monkeypatch.setattr(distilling, name, value)
 
 
+@pytest.mark.long
 def test_a_policy_is_distilled(small, tmp_path, capsys):
     """The rules are played by `evaluate`, and lose what the report says."""
     out = tmp_path / "rules.json"

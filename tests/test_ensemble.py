@@ -73,6 +73,7 @@ def assert_same(place, found, wanted, text):
         assert np.array_equal(found.error, wanted.error), text
 
 
+@pytest.mark.thin(6)
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.thin(2) if name in ("platoon", "network") else ()) for name in PLACES]
 )
@@ -91,6 +92,7 @@ def test_a_row_plays_what_its_text_says(name):
     assert {f.name for f in space.families} == {f.name for f in FAMILIES if {f.kind, f.then or f.kind} <= _granted(place)}
 
 
+@pytest.mark.thin(6)
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.thin(2) if name in ("platoon", "network") else ()) for name in PLACES]
 )
@@ -202,6 +204,7 @@ def test_a_published_start_keeps_its_kinds(tmp_path):
     np.testing.assert_array_equal(wanted.gap, again.gap)
 
 
+@pytest.mark.long
 def test_no_two_starts_share_a_name():
     """Their files are named by it: two ramps, one of a script of one size, have two names."""
     place = arena("car", threat={"kinds": ("dos_jam", "fdi"), "fdi_bound": 4.0})

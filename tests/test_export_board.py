@@ -40,6 +40,7 @@ def test_bibtex_names_the_board_and_its_version() -> None:
     assert text.count("{") == text.count("}") and TITLE in text and TITLE in (FILE.parents[2] / "CITATION.cff").read_text()
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize(("form", "start"), [("svg", b"<?xml"), ("pdf", b"%PDF")])
 def test_pictures_are_vectors_and_repeat(form: str, start: bytes, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")

@@ -114,7 +114,7 @@ FACE_NAMES = ("single", "sb3", *AUTORESETS)
 PLAYED = [(name, engine) for name in FACES for engine in ("auto", "plain") if (name, engine) != (HIGHWAY, "plain")]
 
 
-@pytest.mark.thin(4)
+@pytest.mark.thin(10)
 @pytest.mark.parametrize("face", FACE_NAMES)
 @pytest.mark.parametrize("name, engine", PLAYED)
 def test_nothing_that_was_handed_out_is_used_again(name, engine, face, tiny):
@@ -156,7 +156,7 @@ def test_rows_of_a_cell_share_nothing():
 COPIES = {"pickle": lambda env: pickle.loads(pickle.dumps(env)), "deepcopy": copy.deepcopy}
 
 
-@pytest.mark.thin(7)
+@pytest.mark.thin(16)
 @pytest.mark.parametrize("how", COPIES)
 @pytest.mark.parametrize("face", FACE_NAMES)
 @pytest.mark.parametrize("name, engine", PLAYED)
@@ -200,6 +200,7 @@ def test_a_defence_whose_state_lies_elsewhere_is_not_copied(how):
         COPIES[how](env)
 
 
+@pytest.mark.long
 def test_the_game_is_copied_in_mid_episode():
     """PettingZoo's environment, the defender's, and both go on alike."""
     pytest.importorskip("pettingzoo")
@@ -265,7 +266,7 @@ def test_the_game_is_shown_in_a_window(monkeypatch):
 
 
 @pytest.mark.parametrize("autoreset", AUTORESETS)
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 def test_pictures_of_the_fast_engine_are_those_of_the_plain_loop(autoreset, brief):
     """Looked at now and then, through collisions, ends and resets by mask: the same pixels, and not one bit of another step."""
     pytest.importorskip("PIL")
@@ -316,6 +317,7 @@ def test_a_single_environment_that_may_be_drawn_stays_fast():
     assert fast.batch.engine == "traced" and fast._alone is not None
 
 
+@pytest.mark.long
 def test_decisions_are_kept_for_two_episodes_at_most(brief):
     """A run of many episodes that nobody looks at stays small; a look then is right, and costs the present episodes alone."""
     pytest.importorskip("PIL")

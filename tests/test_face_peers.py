@@ -35,6 +35,7 @@ def test_the_autoreset_mode_is_an_attribute_and_an_argument():
             assert env.autoreset_mode is env.metadata["autoreset_mode"] is mode
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("engine", ["auto", "plain"])
 @pytest.mark.parametrize("autoreset", AUTORESETS)
 def test_a_limit_of_steps_is_that_of_gymnasium(autoreset, engine):
@@ -74,7 +75,7 @@ def test_a_limit_of_steps_is_that_of_gymnasium(autoreset, engine):
 
 
 @pytest.mark.parametrize("name", FACES)
-@pytest.mark.thin(2)
+@pytest.mark.thin(6)
 def test_the_spec_says_the_horizon(name):
     """`spec.max_episode_steps` is the number of decisions; a spec that is made again ends at the same one."""
     few = {"defence": "dkf"} if name == "tailgate/SensorNetwork-v0" else {}  # its default takes long to compile
@@ -96,6 +97,7 @@ def test_a_bad_limit_is_refused(bad):
         AdversaryVectorEnv(2, max_episode_steps=bad)
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("name", FACES)
 def test_information_has_one_set_of_names_and_types(name):
     """Single, vector and Stable-Baselines3's face: the same keys, and NumPy's types, so that a reader may ask for a dtype."""

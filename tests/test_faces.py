@@ -53,7 +53,7 @@ def strict(monkeypatch):
         yield
 
 
-@pytest.mark.thin(4)
+@pytest.mark.thin(16)
 @pytest.mark.parametrize("turn, knowledge", [(0, "black"), (1, "grey"), (2, "white")])
 @pytest.mark.parametrize("action", ACTIONS)
 def test_both_checkers_pass_without_a_warning(action, turn, knowledge, strict, brief_scenario):
@@ -65,7 +65,7 @@ def test_both_checkers_pass_without_a_warning(action, turn, knowledge, strict, b
         sb3.check_env(gymnasium.make(ID, **arguments), warn=True)
 
 
-@pytest.mark.thin(4)
+@pytest.mark.thin(8)
 @pytest.mark.parametrize("knowledge, sees", [("black", True), ("white", False)])
 @pytest.mark.parametrize("action", ACTIONS)
 @pytest.mark.parametrize("name", [RADAR, PLATOON, NETWORK])
@@ -80,6 +80,7 @@ def test_both_checkers_pass_on_every_system(name, action, knowledge, sees, stric
         sb3.check_env(gymnasium.make(name, **arguments), warn=True)
 
 
+@pytest.mark.thin(6)
 @pytest.mark.parametrize("name", FACES)
 def test_the_checker_passes_with_its_render_check(name, strict, monkeypatch):
     """Each id as it comes, every declared render mode included."""
@@ -148,6 +149,7 @@ def _actions(vec, steps, seed=0):
 SEEDED = [*((ID, action, interval) for action in ACTIONS for interval in (1, 3)), (PLATOON, "mode", 1), (PLATOON, "increment", 3), (NETWORK, "ramp", 3), (NETWORK, "continuous", 1)]
 
 
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("name, action, interval", SEEDED)
 def test_row_i_is_the_single_environment_of_seed_s_plus_i(name, action, interval, tiny, same_bits):
     """Two whole episodes: observation, reward, flags and info of every row, bit for bit; autoreset adds 1 to the episode."""

@@ -158,6 +158,7 @@ def test_the_fast_path_has_the_signals_mean_and_variance(in_band, d, power):
     assert fast.valid.any() and slow.valid.any()
 
 
+@pytest.mark.long
 def test_service_is_denied_below_the_threshold():
     """Outliers are absent at 21 dB, some at 11 dB and most at 5 dB after integration, on the signal path."""
     for d, low, high in ((4.5, 0.0, 0.01), (14.0, 0.15, 0.40), (30.0, 0.90, 1.0)):

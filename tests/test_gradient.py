@@ -56,6 +56,7 @@ def figures(loop, trace):
     return gap, np.max(loop.model.error(trace.signals["estimate"], trace.signals["truth"]), axis=2)
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("name", LOOPS)
 def test_the_torch_form_has_the_bits_of_the_loop(name):
     """Gaps and errors under a schedule are those of the program that is exported, played by the plain loop."""
@@ -71,6 +72,7 @@ def test_the_torch_form_has_the_bits_of_the_loop(name):
         assert np.array_equal(got.detach().numpy()[:count][live], wanted[:count][live])
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", SMOOTH)
 def test_derivatives_are_those_of_finite_differences(name):
     """The squares of all errors, by what is injected."""
@@ -114,6 +116,7 @@ def responses(loop, keys):
     return np.array(out)
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("budget", [None, 6])
 def test_a_linear_loop_is_led_to_its_optimum(budget):
     """The farthest error under bounded false data is a linear programme: the bound times the sum of the largest responses along a direction."""
@@ -201,6 +204,7 @@ ARENA = Arena("test", "braking-v0", 20, "kf", {"kinds": ("fdi",), "fdi_bound": 3
 TINY = Pace(64, 1, 2, 8)
 
 
+@pytest.mark.long
 def test_the_search_is_repeatable_and_its_file_is_an_attack(tmp_path, capsys, monkeypatch):
     told = []
     for name in ("FINAL", "COMPARED"):
@@ -248,6 +252,7 @@ def test_no_false_data_no_schedule(tmp_path):
     assert gradient(dataclasses.replace(ARENA, threat={"kinds": ("dos_hold",)}), TINY, tmp_path) == []
 
 
+@pytest.mark.long
 def test_hindsight_is_no_less_than_the_schedule_itself():
     loop = ARENA.loop
     values = np.full((steps_of(loop.brief), *loop.brief.granted.shape), -3.0) * loop.brief.granted

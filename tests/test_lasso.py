@@ -336,6 +336,7 @@ def test_the_centralised_reference_is_better_than_each_agent_alone():
     assert {"redundant", "measurements"} <= set(entries("defence")["centralised_lasso"].uses)
 
 
+@pytest.mark.long
 def test_140_sensors_are_solved_exactly():
     """The stacked network of chapter 5 under its attack: the optimality conditions hold to 1e-11 of lam."""
     model, rng = stacked(load_scenario("thesis-ch5-v0").brief().model), np.random.default_rng(1)

@@ -101,7 +101,7 @@ def test_it_learns_what_to_inject(name: str, least: float, paid: dict[str, Any],
     assert earned(run.export(tmp_path / "policy", {}), environment, action) > least
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(6)
 @pytest.mark.parametrize("name", SMALL)
 def test_a_resumed_run_gives_the_policy_of_an_uninterrupted_one(name: str, paid: dict[str, Any], tmp_path: Path, same_bits: Any) -> None:
     """To the last bit, in networks, buffer, environments and curve: the interruption falls into the middle of episodes."""
@@ -132,6 +132,7 @@ def test_a_resumed_run_gives_the_policy_of_an_uninterrupted_one(name: str, paid:
     assert a.with_suffix(".safetensors").read_bytes() == b.with_suffix(".safetensors").read_bytes()
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("name", SMALL)
 def test_two_runs_of_one_seed_are_equal_and_of_two_seeds_are_not(
     name: str, paid: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -166,6 +167,7 @@ def predicted(run: Any, observation: Any, memory: Any, first: bool, mask: Any) -
 PLAYED = [*((name, SMALL[name][1]) for name in SMALL), ("ppo", "increment"), ("recurrent_ppo", "continuous")]
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize(("name", "action"), PLAYED, ids=lambda value: str(value))
 def test_what_is_exported_is_what_torch_predicts(name: str, action: str, paid: dict[str, Any], tmp_path: Path) -> None:
     """Over whole episodes: outputs within 1e-5, and the same actions; the policy played as an attack gives the very trace."""

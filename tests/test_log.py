@@ -138,6 +138,7 @@ def test_what_is_held_out_is_held_out_under_other_names(tmp_path: Path) -> None:
     assert "`program:path=slow_ramp_then_hold`" in (tmp_path / "log/README.md").read_text()
 
 
+@pytest.mark.long
 def test_a_policy_that_grows_its_values_is_in_no_log_where_ramps_are_held_out(tmp_path: Path) -> None:
     """The policy of the zoo that the suite of platoons plays; those that choose moments alone are in the logs."""
     suite = dataclasses.replace(load_suite("platoon-v0"), scenarios=("platoon-gusty-v0",))
@@ -252,6 +253,7 @@ def test_the_card_and_the_schema_describe_every_column(made: tuple[Path, dict[st
     assert "CC0" in card and held["suite"] in card
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize(
     ("scenario", "defence", "attack", "names"),
     [

@@ -296,7 +296,7 @@ def test_the_thesis_network_converges_and_withstands_the_attack():
     assert 1.5 < np.median(worst["norm_resilient"]) < 3.0 and np.median(worst["dkf"]) > 1000.0
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(6)
 @pytest.mark.parametrize("defence", ["norm_resilient", "norm_resilient:gain=varying"])
 @pytest.mark.parametrize("attack", ["fdi_gaussian:sd=700,chance=0.9", "dropout:probability=0.3,chance=0.6"])
 def test_network_rows_do_not_depend_on_their_batch(defence, attack):

@@ -108,7 +108,7 @@ def test_rows_are_steered_on_their_own():
 
 
 @pytest.mark.parametrize("interval", [1, 7, 20])
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 def test_masks_agree_with_what_the_channel_accepts(interval):
     """In random play no allowed action is refused throughout, and every other one than none is where its mask is 0."""
     threat = {"budget": 25, "duration": 6, "cooldown": 4, "onset": 20, "end": 200}

@@ -55,7 +55,7 @@ def _policy(path: Path, action: dict[str, Any], knowledge: str = "black", seed: 
     return save_policy(path / "policy", network, header)
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(9)
 @pytest.mark.parametrize("interval", [1, 5])
 @pytest.mark.parametrize("knowledge", ["black", "white"])
 @pytest.mark.parametrize("action", ["timing", "mode", "ramp", "continuous", "increment"])
@@ -318,6 +318,7 @@ def _special(path: Path, kind: str, seed: int = 1) -> Path:
     return save_policy(path / "policy", network, header)
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("kind", ["recurrent", "masked", "squashed"])
 def test_a_policy_of_every_kind_plays_alone_as_in_company_and_steps_as_it_plays(tmp_path: Path, kind: str, same_bits: Any) -> None:
     """A batch of 1 and a row of 64 agree to the bit, and so do the environment stepped by hand and the attack."""

@@ -333,6 +333,7 @@ def test_a_class_that_cannot_be_made_is_refused_with_its_line(name, line, tmp_pa
         Spec("defence", f"foreign_lines:{name}").make()
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("heavy", ["torch", "cvxpy", "highway_env"])
 def test_components_are_listed_without_the_extras(heavy):
     """The light install has none of them; only the learners need torch."""

@@ -167,6 +167,7 @@ def test_bad_input(arguments, named, capsys):
         reproduce("ch4", seeds=1)
 
 
+@pytest.mark.thin(2)
 @pytest.mark.page
 @pytest.mark.parametrize("width", [360, 1280])
 def test_the_page_in_a_browser(chapter_4, load, asked, width):

@@ -38,7 +38,7 @@ def test_the_weights_come_out_again(policies: list[Path]) -> None:
     assert len({retrain(str(path)).here for path in policies}) == 2
 
 
-@pytest.mark.thin(2)
+@pytest.mark.long
 def test_a_policy_of_the_zoo_is_its_source(policies: list[Path], tmp_path: Path) -> None:
     """Its weights are packed, PPO's into half the bytes; a record that claims another source changes nothing."""
     path = add_policy(policies[0], "packed", "a copy", episodes=2, folder=tmp_path)
@@ -50,7 +50,7 @@ def test_a_policy_of_the_zoo_is_its_source(policies: list[Path], tmp_path: Path)
     assert again.verdict == "differs" and again.here == retrain(str(path)).here
 
 
-@pytest.mark.thin(2)
+@pytest.mark.long
 def test_what_was_trained_with_is_recorded_and_told(policies: list[Path], tmp_path: Path) -> None:
     training = json.loads(policies[0].read_text())["training"]
     held, torch = training["made_with"], training["learner"] == "ppo"

@@ -28,6 +28,7 @@ def test_pairing_narrows_the_interval() -> None:
     assert paired.low > 0.0 and (paired.high - paired.low) < 0.5 * (shuffled.high - shuffled.low)
 
 
+@pytest.mark.thin(4)
 @pytest.mark.parametrize(("runs", "spread"), [(1, 0.0), (3, 0.0), (3, 0.1), (5, 0.2)])
 def test_coverage_with_few_training_seeds(runs: int, spread: float) -> None:
     """95 % intervals hold the truth in at least 92 % of 300 simulated comparisons, whatever the spread between training seeds."""

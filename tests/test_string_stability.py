@@ -116,6 +116,7 @@ def test_sampled_cars_measure_what_the_model_says():
     np.testing.assert_allclose(found.speed, want, rtol=0.03)
 
 
+@pytest.mark.long
 def test_attacks_on_messages_break_a_string_and_a_control_defence_mends_it():
     """Ploeg's law behind messages 2 s old amplifies from car to car; on the own sensors alone it does not."""
     place = dataclasses.replace(load_scenario("platoon-v2v-v0").with_threat(onset=1), controller=make("controller", "ploeg_cacc"))

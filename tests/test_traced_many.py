@@ -111,7 +111,7 @@ NETWORKS = [
 ]
 
 
-@pytest.mark.thin(7)
+@pytest.mark.thin(14)
 @pytest.mark.parametrize(("scenario", "defence", "attack", "threat"), PLATOONS + NETWORKS)
 def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack, threat):
     many = {"onset": 10, "end": 80} if scenario in (RESTLESS, WEAK, NOISY, LARGE, THESIS, "network-weak-v0") else {}
@@ -205,7 +205,7 @@ ENVIRONMENTS = [
 ]  # fmt: skip
 
 
-@pytest.mark.thin(7)
+@pytest.mark.thin(14)
 @pytest.mark.parametrize("arguments", ENVIRONMENTS, ids=lambda a: f"{a['scenario']}-{a['defence']}")
 def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
     """Observations, rewards, flags and information, over restarts, a masked reset and what was held."""
@@ -247,6 +247,7 @@ def test_what_an_attacker_sees_and_may_do_is_as_in_the_plain_loop(scenario, defe
     assert 0 < np.count_nonzero(refused) < np.size(refused)
 
 
+@pytest.mark.thin(4)
 @pytest.mark.parametrize(("scenario", "reward"), [("platoon-gusty-v0", "collision"), (THESIS, "error")])
 @pytest.mark.parametrize("action", ["mode", "continuous"])
 def test_a_single_environment_is_a_batch_of_one(action, scenario, reward):

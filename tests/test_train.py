@@ -193,6 +193,7 @@ def test_learners_may_share_what_was_played(here: Path, small_run: tuple[str, ..
     assert [comparison.finished(config, found) for config, found in zip(configs, policies, strict=True)] == [None, None]
 
 
+@pytest.mark.long
 def test_the_final_comparison_begins_at_the_episode_that_is_named(here: Path, small_run: tuple[str, ...]) -> None:
     """Learned, scripted and yoked alike play that block, and no policy depends on it."""
     wanted, hashes = {}, set()
@@ -206,6 +207,7 @@ def test_the_final_comparison_begins_at_the_episode_that_is_named(here: Path, sm
     assert len(hashes) == 1 and not set(wanted[0]) & set(wanted[1000])
 
 
+@pytest.mark.long
 def test_decisions_beyond_those_that_were_asked_for_are_said(
     here: Path, capsys: pytest.CaptureFixture[str], small_run: tuple[str, ...]
 ) -> None:
@@ -254,7 +256,7 @@ def test_a_preset_may_change_another(tmp_path: Path) -> None:
             train.load_config(str(mine), [])
 
 
-@pytest.mark.thin(2)
+@pytest.mark.long
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_the_command_trains_on_every_system(here: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Policy, comparison by the system's own outcome, yoked twin and page; the policy plays in an evaluation of its scenario."""
@@ -295,6 +297,7 @@ def test_an_outcome_is_a_metric_that_every_episode_has(tmp_path: Path) -> None:
         outcomes([row], "recovery_time")
 
 
+@pytest.mark.long
 def test_a_run_that_was_killed_and_resumed_gives_the_policy_of_an_uninterrupted_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_run: tuple[str, ...]
 ) -> None:
@@ -374,6 +377,7 @@ def test_training_seeds_share_no_environment() -> None:
     assert not keys[0] & keys[1]
 
 
+@pytest.mark.long
 def test_a_fresh_start_forgets_the_run_before_and_resume_wants_the_same_learner(
     here: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], small_run: tuple[str, ...]
 ) -> None:

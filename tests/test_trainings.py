@@ -38,6 +38,7 @@ def nobody(*_: object) -> None:
     pass
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("workers", [1, 2])
 def test_one_that_fails_is_named_and_cuts_nobody_short(tmp_path: Path, workers: int) -> None:
     """Seed 0 of the first run cannot go on. What runs beside it comes to its end, nothing new begins, and the error says which it is."""
@@ -52,6 +53,7 @@ def test_one_that_fails_is_named_and_cuts_nobody_short(tmp_path: Path, workers: 
     assert not second.directory.exists()
 
 
+@pytest.mark.long
 def test_an_interrupt_stops_all(tmp_path: Path) -> None:
     """Also while both processes have more to tell than a pipe holds, which nobody reads any more."""
     config = plan(tmp_path, "stopped", f"steps={LONG}", "cem={population: 2, episodes: 1, hidden: [1]}")
@@ -67,6 +69,7 @@ def test_an_interrupt_stops_all(tmp_path: Path) -> None:
     assert (config.directory / "config.json").is_file() and not list(config.directory.glob("policy-*"))
 
 
+@pytest.mark.long
 def test_after_a_kill_the_same_command_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """A process that the system kills: the error says what is kept and how to go on, and the policies come out as in peace."""
     given = plan(tmp_path / "peace", "killed")
@@ -114,6 +117,7 @@ def test_processes_that_train_end_with_their_parent(tmp_path: Path) -> None:
     assert sorted(path.name for path in held.glob("checkpoint-*.safetensors")) == ["checkpoint-0.safetensors", "checkpoint-1.safetensors"]
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("gap", [0.0, 0.05])
 def test_two_interrupts_end_a_training_too(tmp_path: Path, gap: float) -> None:
     """Impatient users press twice: the second one cuts short the pool's end, and still nobody waits for workers that wait for work."""

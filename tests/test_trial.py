@@ -23,6 +23,7 @@ adaptive: {ensemble: quick}
 CLASS = "from tailgate.estimators import GatedKalman\n\n\nclass Mine(GatedKalman):\n    pass\n"
 
 
+@pytest.mark.long
 def test_from_a_class_to_its_place_on_a_board(
     small_ensemble: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -3,6 +3,8 @@
 import dataclasses
 import tracemalloc
 
+import pytest
+
 from tailgate.core.scenario import load_suite
 from tailgate.trust.cells import check_cell
 from tailgate.trust.run import jobs_of
@@ -26,6 +28,7 @@ def test_a_rule_stops_within_a_batch():
     assert sum(bin(byte).count("1") for byte in bytes.fromhex(row["conjunctions"]["trust"]["runs"])) == row["properties"][0]["k"]
 
 
+@pytest.mark.long
 def test_memory_does_not_grow_with_the_number_of_runs():
     """Three times as many runs: a few bytes for each, whether it holds, and no trace."""
     peaks = []

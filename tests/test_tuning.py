@@ -51,6 +51,7 @@ def straight(tmp_path_factory: pytest.TempPathFactory) -> tuple[tuning.Search, d
     return search, tuning.tune(search)
 
 
+@pytest.mark.long
 def test_an_interrupted_search_goes_on_as_if_it_had_not_been(tmp_path: Path, straight: tuple[tuning.Search, dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     """Cut off in the third trial's training: the same values and outcomes in the end, and the trial that was cut off is marked as failed."""
     search, count = _search(tmp_path, 4), 0

@@ -65,6 +65,7 @@ def test_a_row_is_the_same_with_other_workers_batches_and_companions(tmp_path: P
     assert len(calls) == 3 and [row["trace_hash"] for row in again[:300]] == [row["trace_hash"] for row in held]
 
 
+@pytest.mark.long
 def test_a_row_is_the_same_in_a_batch_of_4096() -> None:
     """4100 episodes that were played 256 at once, again as a full batch and four that are left."""
     (cell,) = cells_of(dataclasses.replace(SUITE, scenarios=("thesis-ch4-v0",), doses=(5,), attacks=("fdi:value=5",), seeds=4100))
@@ -73,7 +74,7 @@ def test_a_row_is_the_same_in_a_batch_of_4096() -> None:
     assert verify(run([cell]), batch=4096)["counts"] == {"verified": 4100, "differs": 0, "unchecked": 0}
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(3)
 @pytest.mark.parametrize(("suite", "scenario", "dose", "defence", "attack", "seeds"), [
     ("car-following-v0", "car-following-noisy-v0", 10, "chi2_kf", "stealth:trigger=near,threshold=40", 300),
     ("car-following-v0", "car-following-lossy-v0", 10, "imm", "zoo:name=car-following-chi2_kf-0", 40),
@@ -109,6 +110,7 @@ def test_rows_of_boards_are_the_same_in_any_batch_company_and_order(
     assert verify(some, workers=2, batch=7)["counts"] == {"verified": len(some), "differs": 0, "unchecked": 0}
 
 
+@pytest.mark.long
 def test_rows_of_a_radar_a_platoon_and_a_network_are_the_same_too() -> None:
     """Filters of one car and of many agents, over the air and on wires: side by side, three at once in two processes, and each by itself."""
     cells = [

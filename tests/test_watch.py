@@ -35,6 +35,7 @@ def _played(scenario: str, guard: object, uses: tuple[str, ...], attack: str, *,
     return rollout(loop, Spec("attack", attack).make(), keys("tune", range(6)), plain=plain)
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize(("scenario", "name", "attack"), CASES)
 def test_a_watch_alarms_by_the_score_and_changes_nothing_else(scenario: str, name: str, attack: str) -> None:
     """In both engines, to the last bit; alarms are those of the score."""
