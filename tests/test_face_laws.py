@@ -10,11 +10,11 @@ import pytest
 
 import tailgate
 from tailgate.base.errors import InputError
-from tailgate.envs.gym.gymnasium_env import FACES, AdversaryEnv, AdversaryVectorEnv
+from tailgate.envs.gym.gymnasium_env import AdversaryEnv, AdversaryVectorEnv
 from tailgate.evaluation.cells import Cell, run_cell
 
 from .engines import short as shortened
-from .tiny import AUTORESETS, CRASHES, write
+from .tiny import AUTORESETS, CRASHES, SYSTEMS, write
 
 CAR, PLATOON, NETWORK, HIGHWAY = "tailgate/CarFollowing-v0", "tailgate/Platoon-v0", "tailgate/SensorNetwork-v0", "tailgate/Highway-v0"
 
@@ -64,7 +64,7 @@ class Driver:
     """One face, stepped with the actions of a seed; what it hands out at a step, all in one tuple."""
 
     def __init__(self, name, arguments, face, seed=0):
-        arguments = FACES[name] | arguments
+        arguments = SYSTEMS[name] | arguments
         self.rng, self.face, self.over = np.random.default_rng(seed), face, False
         if face == "single":
             self.env = AdversaryEnv(**arguments)
@@ -111,7 +111,7 @@ def tiny(tmp_path_factory):
 
 
 FACE_NAMES = ("single", "sb3", *AUTORESETS)
-PLAYED = [(name, engine) for name in FACES for engine in ("auto", "plain") if (name, engine) != (HIGHWAY, "plain")]
+PLAYED = [(name, engine) for name in SYSTEMS for engine in ("auto", "plain") if (name, engine) != (HIGHWAY, "plain")]
 
 
 @pytest.mark.thin(10)

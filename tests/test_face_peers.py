@@ -9,9 +9,9 @@ from gymnasium.vector import AutoresetMode
 
 import tailgate
 from tailgate.base.errors import InputError, UnknownArgument
-from tailgate.envs.gym.gymnasium_env import FACES, AdversaryEnv, AdversaryVectorEnv
+from tailgate.envs.gym.gymnasium_env import AdversaryEnv, AdversaryVectorEnv
 
-from .tiny import AUTORESETS, CRASHES
+from .tiny import AUTORESETS, CRASHES, SYSTEMS
 
 CAR, HIGHWAY = "tailgate/CarFollowing-v0", "tailgate/Highway-v0"
 
@@ -74,7 +74,7 @@ def test_a_limit_of_steps_is_that_of_gymnasium(autoreset, engine):
         assert ends >= 6
 
 
-@pytest.mark.parametrize("name", FACES)
+@pytest.mark.parametrize("name", SYSTEMS)
 @pytest.mark.thin(6)
 def test_the_spec_says_the_horizon(name):
     """`spec.max_episode_steps` is the number of decisions; a spec that is made again ends at the same one."""
@@ -98,13 +98,13 @@ def test_a_bad_limit_is_refused(bad):
 
 
 @pytest.mark.thin(3)
-@pytest.mark.parametrize("name", FACES)
+@pytest.mark.parametrize("name", SYSTEMS)
 def test_information_has_one_set_of_names_and_types(name):
     """Single, vector and Stable-Baselines3's face: the same keys, and NumPy's types, so that a reader may ask for a dtype."""
     pytest.importorskip("stable_baselines3")
     from tailgate.envs.gym.sb3 import BatchVecEnv
 
-    env, vec, batch = AdversaryEnv(**FACES[name]), AdversaryVectorEnv(2, **FACES[name]), BatchVecEnv(2, name, max_episode_steps=2)
+    env, vec, batch = AdversaryEnv(**SYSTEMS[name]), AdversaryVectorEnv(2, **SYSTEMS[name]), BatchVecEnv(2, name, max_episode_steps=2)
     _, info = env.reset(seed=0)
     _, told = vec.reset(seed=0)
     batch.reset()

@@ -2,6 +2,9 @@
 
 import yaml
 
+from tailgate.envs.gym.attacker_mdp import FACES
+
+SYSTEMS = {name: defaults for name, defaults in FACES.items() if name.endswith("-v0")}  # an id for each kind of system
 AUTORESETS = ("next_step", "same_step", "disabled")
 CRASHES = {"scenario": "stop-and-go-v0", "defence": "kf", "value": -30.0, "threat": {"onset": 1}, "interval": 5}  # unguarded: it collides
 KINDS = ["dos_jam", "dos_hold", "dropout", "fdi"]

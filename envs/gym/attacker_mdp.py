@@ -30,6 +30,30 @@ FACES: dict[str, dict[str, Any]] = {  # defaults of each id
     "tailgate/LaneKeeping-v0": {"scenario": "lane-keeping-v0", "defence": "chi2_kf", "value": 0.5},
     "tailgate/Highway-v0": {"scenario": "highway-v0", "defence": "chi2_kf"},
 }
+_LEARN: dict[str, Any] = {"gap_shaping": 0.0, "error_shaping": 0.0}
+FACES |= {  # tasks that are worth learning: a budget, decisions that last, no shaping
+    "tailgate/CarFollowing-v1": _LEARN | {
+        "scenario": "gusty-stop-and-go-v0", "defence": "chi2_kf", "value": -3.0, "interval": 20,
+        "threat": {"kinds": ["fdi"], "fdi_bound": 3.0, "budget": 60},
+    },
+    "tailgate/RadarFollowing-v1": _LEARN | {
+        "scenario": "radar-braking-v0", "defence": "chi2_kf", "delay": 60.0, "shares": [0.1], "interval": 5,
+        "threat": {"kinds": ["echo_delay"], "delay_bound": 60.0, "budget": 15},
+    },
+    "tailgate/Platoon-v1": _LEARN | {
+        "scenario": "platoon-braking-v0", "defence": "lasso_dkf", "value": 5.0, "interval": 40,
+        "threat": {"kinds": ["dos_hold", "fdi"], "targets": ["distance", "velocity"], "fdi_bound": 5.0, "budget": 80},
+    },
+    "tailgate/SensorNetwork-v1": _LEARN | {
+        "scenario": "thesis-ch5-v0", "defence": "trust_dkf", "reward": "error", "interval": 5, "threat": {"budget": 20},
+    },
+    "tailgate/LaneKeeping-v1": _LEARN | {
+        "scenario": "lane-keeping-v0", "defence": "chi2_kf", "value": 0.5, "interval": 20, "threat": {"budget": 60},
+    },
+}  # fmt: skip
+FACES |= {
+    f"tailgate/{name}Continuous-v1": FACES[f"tailgate/{name}-v1"] | {"action": "continuous"} for name in ("CarFollowing", "Platoon", "LaneKeeping")
+}
 
 
 class Tally(NamedTuple):
