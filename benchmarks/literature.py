@@ -52,6 +52,7 @@ METHODS = {
     "etpl": "etpl:s=2,window=10",
     "l0_robust": "l0_robust:s=2,window=10",
     "minimax": "minimax:attacked=2",
+    "envelope": "envelope:path=redundant",
 }
 SLOW = ("l0_robust",)  # is not traced: a search against it would take hours
 ORDER = ("lidar", "radar_long", "wheels", "radar_short", "v2v", "gnss", "camera")  # the most accurate first
