@@ -30,7 +30,7 @@ from tailgate.studies.envelope_sources import from_log, from_scenarios, played
 
 LOOSE = Settings(rate=1e-3)  # 2995 held-out steps show it: five episodes
 NARROW = Settings(margin=0.0, rate=1e-3)
-SHIPPED = {"car-following": "gusty-stop-and-go-v0", "redundant": "redundant-two-v0", "road": "road-following-v0"}
+SHIPPED = {"redundant": "redundant-two-v0", "car-following": "gusty-stop-and-go-v0"}
 
 
 def sheet_of(z, u=None, settings=NARROW, held=None):
@@ -150,7 +150,7 @@ def test_the_score_is_an_order_statistic():
 def learned(tmp_path_factory):
     """An envelope of a few episodes, and the file."""
     path = tmp_path_factory.mktemp("learned") / "mine.json"
-    sheet = from_scenarios(["stop-and-go-v0"], 8, 8, LOOSE)
+    sheet = from_scenarios(["stop-and-go-v0"], 5, 5, LOOSE)
     path.write_text(sheet.model_dump_json())
     assert load_envelope(path) == sheet
     return path
@@ -164,10 +164,11 @@ def alarms(text, scenario, attack, seeds, purpose="report", **threat):
 
 
 def test_no_alarm_in_the_runs_that_it_was_learned_from(learned):
-    trace, alarm = alarms(f"envelope:path={learned},count=1", "stop-and-go-v0", "none", 8, "train")
+    trace, alarm = alarms(f"envelope:path={learned},count=1", "stop-and-go-v0", "none", 5, "train")
     assert not alarm.any() and trace.score.max() <= 1.0 and trace.score.max() > 0.5
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", SHIPPED)
 def test_fresh_clean_runs_leave_no_invariant_too_often(name):
     """Each rate of the file is an upper limit: no invariant is left surely more often."""
@@ -183,13 +184,14 @@ def test_fresh_clean_runs_leave_no_invariant_too_often(name):
 
 
 def test_a_large_bias_is_detected_at_once_and_a_slow_ramp_never():
-    """The required losing case: 0.01 m a step stays inside of every bound for the 50 steps that it has."""
+    """The required losing case: 0.01 m a step stays inside of every bound until the position is 4 m off."""
     place = {"scenario": "redundant-two-v0", "seeds": 20, "budget": 50}
     trace, alarm = alarms("envelope:path=redundant", attack="fdi:start_step=100,value=20", fdi_bound=30.0, **place)
     struck = (trace.kind != 0) & trace.live
     assert struck[99].all() and alarm[101].all() and not alarm[:99].any()  # with the third of three violations
-    trace, alarm = alarms("envelope:path=redundant", attack="fdi_ramp:start_step=100,rate=0.01", **place)
-    assert (trace.kind != 0)[99:149].all() and not alarm.any()
+    trace, alarm = alarms("envelope", "stop-and-go-v0", "fdi_ramp:start_step=100,rate=0.01,targets=[position]", 20, budget=None)
+    error = np.abs(trace.estimate[..., 0, 0] - trace.truth[..., 0, 0])
+    assert (trace.kind != 0)[99:499].all() and not alarm.any() and np.median(error.max(axis=0)) > 3.5
 
 
 def test_one_violation_is_noise_and_three_of_five_are_an_attack():
@@ -281,7 +283,7 @@ def test_a_log_and_its_scenario_teach_the_same(learned, tmp_path):
     from tailgate.studies.log import write_log
 
     folder = tmp_path / "log"
-    write_log("car-following-v0", folder, episodes=8, dev_episodes=8, scenarios=["stop-and-go-v0"], doses=[10], attacks=["fdi:start_step=60,value=3"])
+    write_log("car-following-v0", folder, episodes=5, dev_episodes=5, scenarios=["stop-and-go-v0"], doses=[10], attacks=["fdi:start_step=60,value=3"])
     assert from_log(folder, None, LOOSE).invariants == load_envelope(learned).invariants
     with pytest.raises(InputError, match="one of the log: stop-and-go-v0"):
         from_log(folder, ["braking-v0"], LOOSE)

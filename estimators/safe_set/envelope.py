@@ -230,7 +230,7 @@ class Envelope(Composed):
         self, plan: ComposedPlan, state: ComposedState, innovation: Innovation, received: Received, known_u: Array
     ) -> tuple[EnvelopeMemory, Verdict]:
         memory: EnvelopeMemory = state.detector
-        now, arrived = signals_of(received)
+        now, arrived = signals_of(received, memory.last.shape[-1])
         worst = np.max(ratios(plan.detector_plan, memory, now, arrived, known_u), axis=-1)
         score = nth_largest([worst, *(memory.recent[..., i] for i in range(self.window - 1))], self.count)
         recent = memory.recent
@@ -242,11 +242,14 @@ class Envelope(Composed):
         return EnvelopeMemory(now, arrived, recent), Verdict(score, alarm, suspect)
 
 
-def signals_of(received: Received) -> tuple[Array, Array]:
-    """Return the signals (B, N, S), 0 where nothing arrived, and (B, N, S) bool: what arrived. Messages always do."""
-    assert received.v2v is not None
-    arrived = np.concatenate([received.valid, np.full_like(received.v2v, True, bool)], axis=-1)
-    return np.where(arrived, np.concatenate([received.y, received.v2v], axis=-1), 0.0), arrived
+def signals_of(received: Received, signals: int) -> tuple[Array, Array]:
+    """Return the signals (B, N, S), 0 where nothing arrived, and (B, N, S) bool: what arrived. Messages do, where they are heard."""
+    y, valid, v2v = received.y, received.valid, received.v2v
+    heard = v2v is not None
+    if v2v is None:
+        v2v = num.zeros((*y.shape[:2], signals - y.shape[-1]))
+    arrived = np.concatenate([valid, np.full_like(v2v, heard, bool)], axis=-1)
+    return np.where(arrived, np.concatenate([y, v2v], axis=-1), 0.0), arrived
 
 
 def ratios(plan: EnvelopePlan, memory: EnvelopeMemory, now: Array, arrived: Array, known_u: Array) -> Array:
