@@ -32,6 +32,8 @@ from tailgate.evaluation.stats import limits
 
 LEVEL = 0.95  # of the Clopper-Pearson limit
 TAIL_POINTS = 500  # largest values that a tail is fitted to
+REST = 0.1  # of the half width: by how much a bound is widened at which clean runs rest, as at standstill; the score would rest at 1
+TIES = 20  # steps at a bound that are a rest
 NARROW = 0.5  # a difference is kept below this share of the range of both signals
 TIGHTER = 0.95  # bounds of one sign are kept below this share of the width without regard to it
 SMALL = 1e-2  # variance of a principal component, in those of one standardised signal
@@ -166,11 +168,16 @@ def upper(values: Array, settings: Settings) -> float:
 
 def bounds_of(values: Array, settings: Settings) -> tuple[float, float]:
     """Return the bounds of values (S,), with their margin."""
-    if settings.margin == "gpd":
-        return -upper(-values, settings), upper(values, settings)
     low, high = float(values.min()), float(values.max())
-    wider = settings.margin * 0.5 * (high - low)
-    return low - wider, high + wider
+    if settings.margin != "gpd":
+        wider = settings.margin * 0.5 * (high - low)
+        return low - wider, high + wider
+    ends = [-upper(-values, settings), upper(values, settings)]
+    wider = REST * 0.5 * (ends[1] - ends[0])
+    for i, (extreme, sign) in enumerate(((low, -1.0), (high, 1.0))):
+        if ends[i] == extreme and np.count_nonzero(values == extreme) > TIES:
+            ends[i] += sign * wider
+    return ends[0], ends[1]
 
 
 def learn(signals: Signals, train: Samples, held_out: Samples, settings: Settings, progress: Progress | None = None) -> list[Invariant]:
