@@ -82,7 +82,8 @@ def quantiles(values: list[float]) -> list[float]:
 
 def played(place: Scenario, text: str, against: str, seeds: int, terminate: bool = True) -> Trace:
     """Return report episodes of a defence under an attack."""
-    loop = place.loop(Spec("defence", text).make())
+    defence = Spec("defence", text)
+    loop = place.loop(defence.make(), defence.entry.uses)
     return rollout(loop, Spec("attack", against).make(), draws.keys("report", range(seeds)), terminate=terminate)
 
 

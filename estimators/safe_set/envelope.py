@@ -263,4 +263,4 @@ def ratios(plan: EnvelopePlan, memory: EnvelopeMemory, now: Array, arrived: Arra
     gone = np.concatenate([~arrived, ~memory.arrived, np.full_like(known_u, False, bool)], axis=-1)
     if num.some(gone):
         off = np.where(num.apply(plan.needed, gone.astype(np.float64)) > 0.0, 0.0, off)
-    return off
+    return np.asarray(off)
