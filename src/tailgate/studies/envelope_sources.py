@@ -6,20 +6,22 @@ import hashlib
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import BaseModel, Field
 
 from tailgate.agents.scripts.scripted import NoAttack
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, said
-from tailgate.base.reading import load_json
 from tailgate.core import draws
+from tailgate.core.quantities import Step
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, load_scenario
+from tailgate.core.schema import read_model
 from tailgate.estimators.safe_set.envelope import Sheet
 from tailgate.studies.envelope import Progress, Samples, Settings, Signals, joined, sampled, sheet_of
-from tailgate.studies.log import FORMAT, SPLITS, pyarrow, steps
+from tailgate.studies.log import SPLITS, pyarrow, steps
 
 AT_ONCE = 64  # episodes that are played together
 
@@ -84,66 +86,77 @@ def _same(where: str, has: Signals, wanted: Signals) -> None:
             raise InputError(f"{where}: {field}", getattr(has, field), f"{getattr(wanted, field)}, as the first scenario has")
 
 
+class _Column(BaseModel):
+    name: str
+
+
+class _Place(BaseModel):
+    """A scenario of a log."""
+
+    columns: list[_Column]
+    dt: Step
+    config_hash: str
+
+    @property
+    def signals(self) -> Signals:
+        names = [column.name for column in self.columns]
+        readings, messages = (
+            tuple(name.removeprefix(prefix) for name in names if name.startswith(prefix)) for prefix in ("reading_", "message_")
+        )
+        return Signals(readings, messages, sum(name.startswith("known_input_") for name in names), self.dt)
+
+
+class _File(BaseModel):
+    """A file of a log, in the folder of its split."""
+
+    path: Annotated[str, Field(pattern=r"^(train|dev)/[^/\x00]+\.parquet$")]
+    split: Literal["train", "dev"]
+    scenario: str
+    sha256: str
+
+
+class _Log(BaseModel):
+    """The fields of a log's schema.json that learning needs."""
+
+    format: Literal["tailgate-log-1"]
+    files: list[_File]
+    scenarios: Annotated[dict[str, _Place], Field(min_length=1)]
+    defences: list[str]
+
+
 def from_log(folder: Path, scenarios: Sequence[str] | None, settings: Settings, progress: Progress | None = None) -> Sheet:
     """Return an envelope of the clean episodes of a log (`tailgate log`): its train split, held out its dev split.
 
     Raise InputError for a folder that is no whole log, or scenarios of different signals.
     """
-    held = _read_schema(folder)
-    names = list(scenarios or held["scenarios"])
-    if strange := [name for name in names if name not in held["scenarios"]]:
-        raise InputError("scenario", strange[0], f"one of the log: {', '.join(held['scenarios'])}")
-    signals = [_signals_in(held["scenarios"][name], name) for name in names]
+    held = read_model(_Log, folder / "schema.json", "log", "tailgate log")
+    names = list(scenarios or held.scenarios)
+    if strange := [name for name in names if name not in held.scenarios]:
+        raise InputError("scenario", strange[0], f"one of the log: {', '.join(held.scenarios)}")
+    signals = [held.scenarios[name].signals for name in names]
     for name, has in zip(names, signals, strict=True):
         _same(f"scenario {name}", has, signals[0])
-    files = [file for file in held["files"] if file["scenario"] in names]
+    files = [file for file in held.files if file.scenario in names]
     splits, counts, digests = [], {}, {}
     for split in SPLITS:
         parts = []
-        for file in (file for file in files if file["split"] == split):
+        for file in (file for file in files if file.split == split):
             parts.append(_read_file(folder, file, signals[0]))
-            digests[file["path"]] = file["sha256"]
+            digests[file.path] = file.sha256
             if progress is not None:
                 progress("reading", len(digests), len(files))
         if not parts:
             raise InputError("log", str(folder), f"a log with files of the split {split}")
         splits.append(joined(parts))
         counts[split] = {"purpose": SPLITS[split], "steps": [len(part.columns) for part in parts]}
-    made = {"from": {name: held["scenarios"][name]["config_hash"] for name in names}, "driven_by": held["defences"], **counts}
+    made = {"from": {name: held.scenarios[name].config_hash for name in names}, "driven_by": held.defences, **counts}
     return sheet_of(signals[0], splits[0], splits[1], settings, made | {"log": digests}, progress)
 
 
-def _read_schema(folder: Path) -> dict[str, Any]:
-    wanted = f"a whole log of `tailgate log` (format {FORMAT})"
-    try:
-        held: dict[str, Any] = load_json(folder / "schema.json")
-        good = held["format"] == FORMAT and all({"path", "split", "scenario", "sha256"} <= set(file) for file in held["files"])
-        good = good and all({"columns", "dt", "config_hash"} <= set(place) for place in held["scenarios"].values()) and held["defences"]
-    except (OSError, ValueError) as error:
-        raise InputError("log", str(folder), f"{wanted}: schema.json cannot be read ({said(error)})") from None
-    except (KeyError, TypeError, AttributeError):
-        good = False
-    if not good:
-        raise InputError("log", str(folder), wanted)
-    return held
-
-
-def _signals_in(place: dict[str, Any], name: str) -> Signals:
-    try:
-        columns = [str(column["name"]) for column in place["columns"]]
-        dt = float(place["dt"])
-    except (KeyError, TypeError, ValueError):
-        raise InputError(f"log: scenarios.{name}", place, "columns with names, and dt") from None
-    named = {prefix: tuple(c.removeprefix(prefix) for c in columns if c.startswith(prefix)) for prefix in ("reading_", "message_")}
-    return Signals(named["reading_"], named["message_"], sum(c.startswith("known_input_") for c in columns), dt)
-
-
-def _read_file(folder: Path, file: dict[str, Any], signals: Signals) -> Samples:
+def _read_file(folder: Path, file: _File, signals: Signals) -> Samples:
     """Return the clean steps of a file of a log. Raise InputError where it is not the file that schema.json describes."""
     pa, pq = pyarrow()
-    path, digest = folder / str(file["path"]), hashlib.sha256()
-    if path.resolve().parent.parent != folder.resolve():
-        raise InputError("log: path", file["path"], "a file in a folder of the log")
+    path, digest = folder / file.path, hashlib.sha256()
     columns = [
         "attack", "episode", "k", "agent", "defence", *(f"reading_{name}" for name in signals.sensors),
         *(f"valid_{name}" for name in signals.sensors), *(f"message_{name}" for name in signals.v2v),
@@ -153,7 +166,7 @@ def _read_file(folder: Path, file: dict[str, Any], signals: Signals) -> Samples:
         with path.open("rb") as content:
             while block := content.read(1 << 20):
                 digest.update(block)
-        if digest.hexdigest() != file["sha256"]:
+        if digest.hexdigest() != file.sha256:
             raise InputError("log", str(path), "the file whose SHA-256 schema.json names: it is damaged or another one")
         table = pq.read_table(path, columns=columns, filters=[("attack", "==", "none")])
         held = {name: table[name].to_numpy() for name in columns}
