@@ -28,7 +28,7 @@ from tailgate.play.trace import rollout
 from tailgate.studies.envelope import Settings, Signals, learn, sampled, upper
 from tailgate.studies.envelope_sources import from_log, from_scenarios, played
 
-LOOSE = Settings(rate=1e-3)  # 2995 held-out steps show it: five episodes
+LOOSE = Settings(rate=1e-2)  # 299 held-out steps show it: one episode
 NARROW = Settings(margin=0.0, rate=1e-3)
 SHIPPED = {"redundant": "redundant-two-v0", "car-following": "gusty-stop-and-go-v0"}
 
@@ -150,7 +150,7 @@ def test_the_score_is_an_order_statistic():
 def learned(tmp_path_factory):
     """An envelope of a few episodes, and the file."""
     path = tmp_path_factory.mktemp("learned") / "mine.json"
-    sheet = from_scenarios(["stop-and-go-v0"], 5, 5, LOOSE)
+    sheet = from_scenarios(["stop-and-go-v0"], 2, 2, LOOSE)
     path.write_text(sheet.model_dump_json())
     assert load_envelope(path) == sheet
     return path
@@ -164,7 +164,7 @@ def alarms(text, scenario, attack, seeds, purpose="report", **threat):
 
 
 def test_no_alarm_in_the_runs_that_it_was_learned_from(learned):
-    trace, alarm = alarms(f"envelope:path={learned},count=1", "stop-and-go-v0", "none", 5, "train")
+    trace, alarm = alarms(f"envelope:path={learned},count=1", "stop-and-go-v0", "none", 2, "train")
     assert not alarm.any() and trace.score.max() <= 1.0 and trace.score.max() > 0.5
 
 
@@ -277,15 +277,15 @@ def test_what_is_no_envelope_is_refused(content, tmp_path):
 # -- the command
 
 
-def test_a_log_and_its_scenario_teach_the_same(learned, tmp_path):
+def test_a_log_and_its_scenario_teach_the_same(tmp_path):
     """Files and play have the same steps: the same invariants to the last bit, and damage is found."""
     pytest.importorskip("pyarrow")
     from tailgate.studies.log import write_log
 
     folder = tmp_path / "log"
-    write_log("car-following-v0", folder, episodes=5, dev_episodes=5, scenarios=["stop-and-go-v0"], doses=[10], attacks=["fdi:start_step=60,value=3"])
-    assert from_log(folder, None, LOOSE).invariants == load_envelope(learned).invariants
-    with pytest.raises(InputError, match="one of the log: stop-and-go-v0"):
+    write_log("car-following-v0", folder, episodes=8, dev_episodes=8, scenarios=["thesis-ch4-v0"], doses=[10], attacks=["fdi:start_step=60,value=3"])
+    assert from_log(folder, None, LOOSE).invariants == from_scenarios(["thesis-ch4-v0"], 8, 8, LOOSE).invariants
+    with pytest.raises(InputError, match="one of the log: thesis-ch4-v0"):
         from_log(folder, ["braking-v0"], LOOSE)
     held = json.loads((folder / "schema.json").read_text())
     file = folder / held["files"][0]["path"]
