@@ -33,7 +33,6 @@ from tailgate.core.schema import read_model
 from tailgate.estimators.compose import Composed, ComposedPlan, ComposedState, Score, part_from
 from tailgate.estimators.parts import Detector, Filter, Mitigation, Verdict
 
-FORMAT = "tailgate-envelope-1"
 MADE_BY = "tailgate learn-envelope"
 FOLDER = Path(str(files("tailgate.configs").joinpath("envelopes")))
 LAST = "last "  # before the name of a signal: its value in the step before
@@ -200,12 +199,9 @@ class Envelope(Composed):
         return [envelope_path(self.path)]
 
     def parts(self) -> tuple[Filter, Detector, Mitigation]:
-        made = (part_from(kind, held, default, f"defence envelope.{kind}") for kind, held, default in self._chosen())
-        f, m = made
+        f = part_from("filter", self.filter, "kf", "defence envelope.filter")
+        m = part_from("mitigation", self.mitigation, "gate_out", "defence envelope.mitigation")
         return f, Score(), m
-
-    def _chosen(self) -> tuple[tuple[Literal["filter", "mitigation"], object, str], ...]:
-        return ("filter", self.filter, "kf"), ("mitigation", self.mitigation, "gate_out")
 
     def prepare(self, model: Model) -> ComposedPlan:
         sheet, where = self.sheet, f"defence envelope {self.path.name}"
