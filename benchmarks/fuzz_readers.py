@@ -8,6 +8,7 @@ import json
 import operator
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -242,6 +243,36 @@ def _log(folder: Path) -> Any:
     return _whole(folder)
 
 
+def _envelope(folder: Path) -> Any:
+    """An envelope, with a digest that fits where there can be one: the checks behind it meet the inputs too."""
+    import tempfile
+
+    from tailgate.core.scenario import load_scenario
+    from tailgate.estimators.safe_set.envelope import Envelope, Sheet
+
+    path = folder / "envelope.json"
+    with tempfile.TemporaryDirectory() as aside:
+        with suppress(ValueError):
+            sheet = Sheet.model_validate_json(path.read_bytes())
+            path = Path(aside, "envelope.json")
+            path.write_text(sheet.model_copy(update={"sha256": sheet.digest}).model_dump_json(), encoding="utf-8")
+        return Envelope(path).prepare(load_scenario("stop-and-go-v0").brief().model)
+
+
+def _taught() -> list[bytes]:
+    columns = [{"name": name} for name in ("reading_a", "valid_a", "message_b", "known_input_0")]
+    file = {"path": "train/a.parquet", "split": "train", "scenario": "a", "sha256": "x"}
+    held = {"format": "tailgate-log-1", "files": [file], "defences": ["kf"], "scenarios": {"a": {"columns": columns, "dt": 0.1, "config_hash": "x"}}}
+    return [json.dumps(held).encode()]
+
+
+def _teach(folder: Path) -> Any:
+    from tailgate.studies.envelope import Settings
+    from tailgate.studies.envelope_sources import from_log
+
+    return from_log(folder, None, Settings())
+
+
 def _parquet() -> list[bytes]:
     import io
 
@@ -417,6 +448,9 @@ def readers() -> dict[str, Reader]:
         Reader("trust cells", "jsonl", "cells.jsonl", lambda: [b'{"cell": "a", "status": "ok", "properties": [], "conjunctions": {}}\n' * 3],
                _call("trust.run", "_read", "cells.jsonl")),
         Reader("report of claims", "json", "report.json", _files("results/reproduction/report.json"), _call("thesis.run", "read", "")),
+        Reader("envelope", "json", "envelope.json", _files("configs/envelopes/*.json"), _envelope,
+               command=("evaluate", "--scenario", "stop-and-go-v0", "--defence", "envelope:path={}", "--out", "rows.jsonl")),
+        Reader("log to learn from", "json", "schema.json", _taught, _teach),
         Reader("log's schema", "json", "schema.json", lambda: [b'{"format": "tailgate-log-1", "identity": "x", "files": [{"path": "README.md", "bytes": 0}]}'], _log),
         Reader("log's part", "parquet", "part.parquet", _parquet, _part),
         Reader("search's journal", "jsonl", "journal.jsonl", _journal, _search, slow=2.0),

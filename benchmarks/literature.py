@@ -52,6 +52,7 @@ METHODS = {
     "etpl": "etpl:s=2,window=10",
     "l0_robust": "l0_robust:s=2,window=10",
     "minimax": "minimax:attacked=2",
+    "envelope": "envelope:path=redundant",
 }
 SLOW = ("l0_robust",)  # is not traced: a search against it would take hours
 ORDER = ("lidar", "radar_long", "wheels", "radar_short", "v2v", "gnss", "camera")  # the most accurate first
@@ -81,7 +82,8 @@ def quantiles(values: list[float]) -> list[float]:
 
 def played(place: Scenario, text: str, against: str, seeds: int, terminate: bool = True) -> Trace:
     """Return report episodes of a defence under an attack."""
-    loop = place.loop(Spec("defence", text).make())
+    defence = Spec("defence", text)
+    loop = place.loop(defence.make(), defence.entry.uses)
     return rollout(loop, Spec("attack", against).make(), draws.keys("report", range(seeds)), terminate=terminate)
 
 

@@ -85,7 +85,7 @@ class Composed:
     ) -> tuple[ComposedState, Estimate]:
         belief = plan.filter.predict(plan.filter_plan, state.filter, known_u)
         innovation = plan.filter.innovation(plan.filter_plan, belief, received)
-        detector, verdict = plan.detector.step(plan.detector_plan, state.detector, innovation)
+        detector, verdict = self.judge(plan, state, innovation, received, known_u)
         mitigation, decision = plan.mitigation.step(plan.mitigation_plan, state.mitigation, verdict, received)
         if decision.forget is not None and num.some(decision.forget):
             belief = plan.filter.forget(plan.filter_plan, belief, decision.forget)
@@ -98,6 +98,13 @@ class Composed:
             plan.filter.estimate(belief), verdict.score, verdict.alarm, decision.mode, np.ones_like(verdict.alarm), decision.limits
         )
         return ComposedState(belief, detector, mitigation), estimate
+
+    def judge(
+        self, plan: ComposedPlan, state: ComposedState, innovation: Innovation, received: Received, known_u: Array
+    ) -> tuple[Any, Verdict]:
+        """Return the detector's next state and its verdict."""
+        verdict: tuple[Any, Verdict] = plan.detector.step(plan.detector_plan, state.detector, innovation)
+        return verdict
 
     def look(self, plan: ComposedPlan, state: ComposedState, received: Received, known_u: Array) -> Look:
         """Return the innovation, gain and gate that `received` would meet; change nothing."""

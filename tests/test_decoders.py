@@ -1,14 +1,17 @@
 """Decoders of windows: against an oracle, where they recover, and what bounds their errors. The Bernoulli filter and the watermark."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 import tailgate
+from tailgate.base.errors import InputError
 from tailgate.core.draws import keys
 from tailgate.core.scenario import load_scenario
 from tailgate.estimators.filters.bernoulli import Bernoulli
 from tailgate.estimators.sparse_attacks.l0_robust import RobustDecoder, explanation, feasible, solve_milp
-from tailgate.estimators.sparse_attacks.l1_decoder import L1Decoder, decoded, grouped
+from tailgate.estimators.sparse_attacks.l1_decoder import L1Decoder, decoded, grouped, programmed
 from tailgate.estimators.sparse_attacks.projected import Etpg, Etpl, ProjectedPlan, orthonormal, solved
 from tailgate.estimators.sparse_attacks.window import Centred, pulled, weighed
 from tailgate.play.trace import rollout
@@ -332,3 +335,36 @@ def test_a_watermark_is_a_part_of_the_command_and_known_to_the_filter():
     added = loud.control - known.control
     assert np.std(added[1:3]) == pytest.approx(0.3, rel=0.3)
     assert loud.score[loud.live].mean() == pytest.approx(known.score[known.live].mean(), rel=0.02)
+
+
+def test_the_linear_program_is_exact():
+    """Its value is that of the dual program, and in many windows below that of 200 rounds; the median is exact."""
+    from scipy.optimize import linprog
+
+    better = 0
+    for trial in range(60):
+        O, Y = _problem(trial)
+        rows, y = O[0].reshape(-1, O.shape[-1]), Y.ravel()
+        x = programmed(rows, y)
+        ours, theirs = np.abs(y - rows @ x).sum(), _objective(O, Y, _solve(O, Y, 1, 200), 1)
+        assert ours <= theirs * (1.0 + 1e-9) + 1e-9, trial
+        better += ours < theirs * (1.0 - 1e-6)
+        dual = linprog(-y, A_eq=rows.T, b_eq=np.zeros(O.shape[-1]), bounds=(-1.0, 1.0))  # no x is below its value
+        assert ours == pytest.approx(-dual.fun, rel=1e-9, abs=1e-9), trial
+    assert better > 0
+    assert programmed(np.ones((5, 1)), np.array([1.0, 1.2, 1.1, 50.0, -80.0]))[0] == pytest.approx(1.1, abs=1e-12)
+
+
+def test_the_exact_decoder_plays():
+    """In the plain loop, to the error of the iteration or less; and it needs r = 1."""
+    place = load_scenario("redundant-two-v0").with_threat(fdi_bound=30.0, onset=1)
+    rival, errors = tailgate.make_attack("fdi", start_step=8, value=-30.0), []
+    for solver in ("weighted", "program"):
+        guard = tailgate.make_defence("l1_decoder", s=2, window=4, norm=1, solver=solver)
+        trace = rollout(dataclasses.replace(place, horizon=16).loop(guard), rival, keys("train", [0]))
+        assert (trace.kind[7:] != 0).all()
+        errors.append(np.abs(trace.estimate[..., 0, 0] - trace.truth[..., 0, 0]))
+    np.testing.assert_allclose(errors[0], errors[1], atol=0.3)
+    assert not np.array_equal(*errors) and errors[1].max() < 3.0
+    with pytest.raises(InputError, match="norm=1"):
+        tailgate.make_defence("l1_decoder", solver="program")

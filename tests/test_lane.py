@@ -1,6 +1,7 @@
 """Lane keeping: the bicycle model against its closed forms, the closed loop, the lane as a road, and what is refused."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -8,10 +9,11 @@ from scipy.linalg import solve_discrete_are
 from scipy.signal import cont2discrete
 
 from tailgate.base.errors import InputError
-from tailgate.core import draws
+from tailgate.core import Estimate, draws
 from tailgate.core.registry import Spec, make
 from tailgate.core.scenario import load_scenario
 from tailgate.envs.controllers.lane_lqr import LaneLqr, regulator
+from tailgate.envs.controllers.lane_stanley import LaneStanley, arctangent
 from tailgate.envs.curves import Curves
 from tailgate.envs.plants.lane_keeping import LaneKeeping, bicycle
 from tailgate.play.metrics import measure
@@ -209,6 +211,53 @@ def test_numbers_that_do_not_fit_are_refused():
         place = load_scenario("gusty-stop-and-go-v0")
         play(dataclasses.replace(place, manoeuvre=Curves()))
     assert LaneLqr().desired_gap(np.zeros(2)).tolist() == [1.75, 1.75]
+
+
+# -- Stanley's law
+
+
+def stanley(**changes):
+    place = load_scenario(NAME)
+    return dataclasses.replace(place, controller=LaneStanley(**changes))
+
+
+def test_the_arctangent_is_numpys():
+    x = np.concatenate([np.linspace(-3.0, 3.0, 6001), [-1e6, -50.0, 1e-12, 1e6]])
+    np.testing.assert_allclose(arctangent(x), np.arctan(x), rtol=1e-15, atol=0.0)
+    assert arctangent(np.zeros(1))[0] == 0.0
+
+
+def test_stanleys_law_by_hand():
+    """0.5 m to the left of the middle, turned to the left by 0.01: to the right by the angle of 0.511 m in the way of a second, and by 0.01."""
+    x = np.array([[[0.5, 0.0, 0.01, 0.0]]])
+    law = LaneStanley(limit=1.0)
+    plan, told = law.prepare(load_scenario(NAME).brief().model), Estimate(x, *np.zeros((4, 1, 1)))
+    _, delta = law.step(plan, None, told, np.zeros((1, 1, 1)), np.zeros((1, 1, 0)))
+    assert delta[0, 0, 0] == pytest.approx(-0.01 - math.atan(0.511 / 20.0), abs=1e-15)
+
+
+def test_stanleys_law_keeps_the_lane():
+    """Without noise it ends in the middle of a bend; on the winding road nobody leaves the lane."""
+    place = dataclasses.replace(quiet(1.0 / R), controller=LaneStanley())
+    assert abs(play(place).truth[-1, 0, 0, 0]) < 1e-3
+    found = measure(play(stanley(), seeds=100))
+    assert not found["crashed"].any() and found["min_gap"].min() > 1.2
+
+
+def test_a_bias_on_the_offset_moves_a_car_under_stanleys_law_too():
+    place = dataclasses.replace(quiet(fdi_bound=1.0, budget=None, end=600, targets=("lane_offset",)), controller=LaneStanley())
+    trace = play(place, attack=f"fdi:start_step=60,value={BIAS}")
+    assert trace.truth[-1, 0, 0, 0] == pytest.approx(-BIAS, abs=0.02)
+
+
+def test_stanleys_law_is_traced_and_fits_its_lane_only():
+    loop, rival = loop_of(NAME, "chi2_kf", "fdi:value=0.5")
+    place = stanley().with_threat(knowledge="black")
+    made = place.loop(loop.defence)
+    object.__setattr__(made, "horizon", 200)
+    trace_as_plain(made, rival)
+    with pytest.raises(InputError, match=r"lane_stanley.margin.*1\.75 m"):
+        LaneStanley(margin=2.0).prepare(load_scenario(NAME).brief().model)
 
 
 def test_a_picture_shows_the_car_and_its_belief():

@@ -49,6 +49,9 @@ CARS = [
     ("stop-and-go-v0", "safe_state_brake:when=always,distance=20,lag=0.5,watch=3", "dropout:trigger=near,threshold=40,probability=0.7"),
     ("car-following-heavy-v0", "safe_state:accuracy=[1,0.5],recover=0.3", "fdi_gaussian:trigger=near,threshold=40,sd=4"),
     ("braking-v0", "safe_state_brake:filter=rkf,adds_up=worst", "fdi:start_step=60,value=3"),
+    ("stop-and-go-v0", "envelope", "fdi_bernoulli:trigger=near,threshold=40,value=-4"),
+    ("car-following-lossy-v0", "envelope:window=1,count=1,mitigation=hold", "dropout:trigger=near,threshold=40,probability=0.5"),
+    ("redundant-two-v0", "envelope:path=redundant,window=9,count=2,filter=rkf,mitigation=reacquire", "fdi:start_step=60,value=20"),
 ]
 # The white-box script against each detector's gate, and aimed at one reading or at both.
 STEALTH = [

@@ -43,6 +43,25 @@ def regulator(A: Array, B: Array, Q: Array, R: float) -> Array:
     raise InputError("controller lane_lqr.weights", Q.diagonal().tolist(), "weights for which the regulator settles: offset above 0")
 
 
+def require_lane(name: str, model: Model, margin: float) -> None:
+    """Raise InputError for a controller `name` in another plant than lane_keeping, or with another margin than its half lane [m]."""
+    if model.actuators != (STEERING,) or model.v2v[:1] != (CURVATURE,):
+        raise InputError(f"controller {name}", list(model.actuators), "the plant lane_keeping, whose actuator is the steering")
+    if margin != model.lane:
+        raise InputError(f"controller {name}.margin", margin, f"the plant's half_lane ({model.lane:g} m)")
+
+
+def steady_bend(model: Model) -> tuple[float, float]:
+    """Return e_psi and the steering angle [rad] for each curvature [1/m] of a steady bend, in the middle of the lane.
+
+    Of x = [0, 0, e, 0] two of the four lines of x = A x + B [delta, 1] tell e and delta; the others follow.
+    """
+    (a, b), (c, d) = ((-model.A[i, 2], -model.B[i, 0]) for i in (1, 3))
+    right = model.B[1, 1], model.B[3, 1]
+    whole = a * d - b * c
+    return float((right[0] * d - b * right[1]) / whole), float((a * right[1] - right[0] * c) / whole)
+
+
 class LanePlan(NamedTuple):
     K: Array  # (4,)
     heading: float  # e_psi of the steady bend for each curvature [rad m]
@@ -64,16 +83,8 @@ class LaneLqr:
     margin: Gap = param(1.75, "distance to the nearer line that it steers for: half of the lane [m]")
 
     def prepare(self, model: Model) -> LanePlan:
-        if model.actuators != (STEERING,) or model.v2v[:1] != (CURVATURE,):
-            raise InputError("controller lane_lqr", list(model.actuators), "the plant lane_keeping, whose actuator is the steering")
-        if self.margin != model.lane:
-            raise InputError("controller lane_lqr.margin", self.margin, f"the plant's half_lane ({model.lane:g} m)")
-        K = regulator(model.A, model.B[:, 0], np.diag(self.weights), self.effort)
-        # the steady bend x = [0, 0, e, 0]: two of the four lines of x = A x + B [delta, 1] tell e and delta, the others follow
-        (a, b), (c, d) = ((-model.A[i, 2], -model.B[i, 0]) for i in (1, 3))
-        right = model.B[1, 1], model.B[3, 1]
-        whole = a * d - b * c
-        return LanePlan(K, float((right[0] * d - b * right[1]) / whole), float((a * right[1] - right[0] * c) / whole))
+        require_lane("lane_lqr", model, self.margin)
+        return LanePlan(regulator(model.A, model.B[:, 0], np.diag(self.weights), self.effort), *steady_bend(model))
 
     def start(self, plan: LanePlan, batch: int) -> None:
         return None

@@ -7,6 +7,10 @@ large an attack is. The least residual that counts starts at the largest one and
 happens to meet. x is optimal where sum_i O_i' u_i = 0, with u_i = res_i/|res_i|, or |u_i| <= 1 where res_i = 0. At
 the end a residual counts as no less than SMALLEST; this moves f by at most that for each term.
 
+With r = 1 this converges slowly. `solver=program` then takes the exact optimum, a linear program for each window (scipy, HiGHS):
+
+    min sum_m t_m     s.t.  -t_m <= Y_m - O_m x <= t_m
+
 s sensors can be corrected where no x has sum_{i in K} |O_i x| >= sum_{i not in K} |O_i x| for any K of s sensors, without noise. Rows over
 the sensors' noise (`rows=sigmas`) break this where the most accurate sensors are attacked.
 """
@@ -18,6 +22,7 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
+from tailgate.base.errors import InputError
 from tailgate.core import Array, Model, Positive, param
 from tailgate.core.registry import register
 from tailgate.estimators.sparse_attacks.window import (
@@ -69,6 +74,20 @@ def decoded(held: Windows, rounds: int) -> Array:
     return num.until(step, [first, begin], np.ones(first.shape[:2], bool), rounds)[0]
 
 
+def programmed(O: Array, Y: Array) -> Array:
+    """Return the x (n,) with the least sum of |Y - O x|, for rows O (M, n) and Y (M,). Raise InputError where HiGHS finds none."""
+    from scipy.optimize import linprog
+
+    (count, n), slack = O.shape, -np.eye(len(O))
+    answer = linprog(
+        np.array([*np.zeros(n), *np.ones(count)]), A_ub=np.concatenate([np.column_stack([O, slack]), np.column_stack([-O, slack])]),
+        b_ub=np.concatenate([Y, -Y]), bounds=[(None, None)] * n + [(0.0, None)] * count, method="highs",
+    )  # fmt: skip
+    if answer.status != 0:
+        raise InputError("l1_decoder: linear program", answer.message, "a solution")
+    return np.asarray(answer.x[:n])
+
+
 def grouped(O: Array, Y: Array, there: Array, norm: int) -> Windows:
     """Return the terms of the objective for r = `norm`."""
     if norm == 2:
@@ -90,12 +109,30 @@ class L1Decoder(Relaxed):
     norm: Literal[1, 2] = param(2, "r: the norm of one sensor's residuals; 2 makes a sensor one term, 1 each of its readings [-]")
     threshold: Positive = param(6.0, "alarm where a residual is larger [standard deviations]")
     rounds: Rounds = param(200, "rounds of the iteration, at most")
+    solver: Literal["weighted", "program"] = param(
+        "weighted", "weighted: weighted least squares again and again; program: exact for r = 1, a linear program for each window, and slow"
+    )
+
+    def __post_init__(self) -> None:
+        if self.solver == "program" and self.norm != 1:
+            raise InputError("defence l1_decoder.solver", self.solver, "norm=1 with it: only that is a linear program")
+
+    @property
+    def untraced(self) -> str:
+        """Why the engine cannot trace it; empty where it can."""
+        return "it solves linear programs, one episode after the other" if self.solver == "program" else ""
 
     def constants(self, plan: WindowPlan, model: Model) -> Array:
         return self.units(plan)
 
     def decode(self, plan: DecoderPlan, own: None, held: Centred) -> tuple[None, Decoded]:
         O, units = plan.window.O, plan.own[..., None]
-        x = decoded(grouped(O * units[..., None], held.Y * units, held.there, self.norm), int(self.rounds))
+        rows, Y = O * units[..., None], held.Y * units
+        x = decoded(grouped(rows, Y, held.there, self.norm), int(self.rounds))
+        if self.solver == "program":
+            x = np.array(x)
+            for b, i in np.argwhere(held.full).tolist():
+                there = held.there[b, i]
+                x[b, i] = programmed(rows[i][there], Y[b, i][there])
         score = np.max(np.where(held.there, np.abs(held.Y - modelled(O, x)), 0.0), axis=(-2, -1))
         return None, Decoded(x, score, score > self.threshold)

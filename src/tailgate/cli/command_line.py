@@ -19,8 +19,8 @@ from tailgate.base.interrupts import Ending, orderly
 
 EXIT_INPUT = 2
 COMMANDS = (
-    "train", "tune", "selfplay", "ensemble", "distil", "evaluate", "timing", "dose", "transfer", "zoo", "calibrate", "leaderboard", "log",
-    "replay", "detect_log", "fit", "reproduce", "cost", "trust", "falsify", "rare", "bench", "list", "explain",
+    "train", "tune", "selfplay", "ensemble", "distil", "evaluate", "timing", "dose", "transfer", "zoo", "calibrate", "learn_envelope",
+    "leaderboard", "log", "replay", "detect_log", "fit", "reproduce", "cost", "trust", "falsify", "rare", "bench", "list", "explain",
 )  # fmt: skip
 
 
