@@ -1,0 +1,99 @@
+"""The reference of the public names: one page a package, from `__all__` and the docstrings."""
+
+import importlib
+import inspect
+import types
+from collections.abc import Iterator
+from typing import Any
+
+from docstrings import escaped, markdown, summary
+from sphinx.util.inspect import stringify_signature
+
+PACKAGES = (
+    "tailgate", "tailgate.core", "tailgate.envs", "tailgate.envs.torch", "tailgate.estimators", "tailgate.agents", "tailgate.evaluation",
+    "tailgate.board", "tailgate.sandbox", "tailgate.thesis", "tailgate.cli",
+)  # fmt: skip
+MODULES = ("tailgate.num",)  # without __all__, and yet what components are written with
+OUTER, INNER = "`" * 7, "`" * 6
+
+
+def public(package: str) -> list[str]:
+    """Return the public names of a package; of a module without `__all__` its own functions and classes."""
+    module = importlib.import_module(package)
+    if package in MODULES:
+        own = [name for name, held in vars(module).items() if callable(held) and getattr(held, "__module__", "") == package]
+        return sorted(name for name in own if not name.startswith("_"))
+    return sorted(module.__all__)
+
+
+def _signature(thing: Any, typed: bool) -> str:
+    """Return a signature as text; empty where Python knows none."""
+    try:
+        signature = inspect.signature(thing)
+    except (TypeError, ValueError):
+        return "()"
+    if not typed:
+        plain = [p.replace(annotation=p.empty) for p in signature.parameters.values()]
+        signature = signature.replace(parameters=plain, return_annotation=signature.empty)
+    text = stringify_signature(signature, unqualified_typehints=True, short_literals=True)
+    return text if "<" not in text else stringify_signature(signature, show_annotation=False)
+
+
+def _members(cls: type, module: str) -> Iterator[str]:
+    """Yield entries of the documented methods and properties that a class defines itself."""
+    for name, held in vars(cls).items():
+        plain = held.__func__ if isinstance(held, (classmethod, staticmethod)) else held
+        if name.startswith("_"):
+            continue
+        if isinstance(plain, property) and markdown(plain):
+            yield "\n".join([f"{INNER}{{py:property}} {name}", "", markdown(plain), INNER, ""])
+        elif isinstance(plain, types.FunctionType) and (plain.__doc__ or "").strip():
+            options = [":classmethod:"] if isinstance(held, classmethod) else [":staticmethod:"] if isinstance(held, staticmethod) else []
+            yield "\n".join([f"{INNER}{{py:method}} {name}{_signature(plain, True)}", *options, "", markdown(plain), INNER, ""])
+
+
+def _entry(package: str, name: str, thing: Any, pages: dict[type, str]) -> str:
+    """Return the entry of a public name, or a link to the page of a component."""
+    if inspect.isclass(thing) and thing in pages:
+        return f"- `{name}`: [{pages[thing].rsplit('/', 1)[1][:-3]}](../{pages[thing]}), {summary(thing)}\n"
+    home = getattr(thing, "__module__", package) or package
+    if not (inspect.isclass(thing) or inspect.isfunction(thing)) or not home.startswith("tailgate"):
+        value = thing if isinstance(thing, (str, int, float, tuple)) else None
+        shown = f"\n\nValue: `{value!r}`" if value is not None and len(repr(value)) < 80 else ""
+        return "\n".join([f"{OUTER}{{py:data}} {name}", f":module: {package}", "", shown.strip() or "See the source.", OUTER, ""])
+    module = home if getattr(importlib.import_module(home), name, None) is thing else package
+    if inspect.isclass(thing):
+        kind = "exception" if issubclass(thing, Exception) else "class"
+        body = [markdown(thing) or "A class.", "", *_members(thing, module)]
+        head = f"{OUTER}{{py:{kind}}} {name}{_signature(thing, False)}"
+    else:
+        body = [markdown(thing) or "A function.", ""]
+        head = f"{OUTER}{{py:function}} {name}{_signature(thing, True)}"
+    found = [] if module == package else [f"From `{package}` as well.", ""]
+    return "\n".join([head, f":module: {module}", "", *body, *found, OUTER, ""])
+
+
+def pages(components: dict[type, str]) -> dict[str, str]:
+    """Return path -> Markdown of the reference; `components` has the page of each registered class."""
+    out = {}
+    rows = []
+    for package in (*PACKAGES, *MODULES):
+        try:
+            module = importlib.import_module(package)
+            names = public(package)
+            held = {name: getattr(module, name) for name in names}
+        except ImportError as error:  # an extra that is not installed
+            out[f"{package}.md"] = f"# {package}\n\nThis reference was built where `{error.name}` is not installed.\n"
+            continue
+        shown = {name: _entry(package, name, thing, components) for name, thing in held.items()}
+        linked = [text for text in shown.values() if text.startswith("- ")]
+        text = [f"# {package}", "", markdown(module), ""]
+        if linked:
+            text += ["## Components", "", "Each has a page of its parameters.", "", *linked, ""]
+        text += ["## Names", "", *(text for text in shown.values() if not text.startswith("- "))]
+        out[f"{package}.md"] = "\n".join(text)
+        rows.append(f"| [{package}]({package}.md) | {summary(module)} | {len(names)} |")
+    tree = ["```{toctree}", ":hidden:", ":maxdepth: 1", "", *(name.removesuffix(".md") for name in out), "```", ""]
+    head = ["# API", "", "Public names, from the docstrings. Other names may change without an entry in the changelog.", ""]
+    out["index.md"] = "\n".join([*head, *tree, "| package | what it is | names |", "|---|---|---|", *rows, ""])
+    return out

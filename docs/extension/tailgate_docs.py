@@ -1,0 +1,120 @@
+"""The Sphinx extension of this site: pages from code, files and boards, links that hold, names of components that lead to their pages."""
+
+import re
+from pathlib import Path
+from typing import Any, ClassVar
+
+import api
+import boards
+import components
+import staged
+from docutils import nodes
+from links import Links, section
+from sphinx.application import Sphinx
+from sphinx.transforms.post_transforms import SphinxPostTransform
+
+GENERATED = "generated"
+_FROM_README = re.compile(r"<!-- from README: ([^>]+?) -->")
+_FAMILIES = ("defence", "attack", "scenario", "suite", "plant", "sensor", "detector", "filter", "mitigation", "controller", "manoeuvre")
+
+
+def _put(path: Path, text: str) -> None:
+    """Write a page if it differs: an unchanged one is not read again."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not path.is_file() or path.read_text(encoding="utf-8") != text:
+        path.write_text(text, encoding="utf-8")
+
+
+def _generate(app: Sphinx) -> None:
+    docs = Path(app.srcdir).resolve()
+    root, folder = docs.parent, docs / GENERATED
+    texts: dict[Path, str] = {}
+    made = components.Pages(root)
+    texts |= {folder / "components" / name: text for name, text in made.all().items()}
+    classes = {entry.cls: f"components/{family}/{name}.md" for family, group in made.entries.items() for name, entry in group.items()}
+    texts |= {folder / "api" / name: text for name, text in api.pages(classes).items()}
+    held = boards.published(root)
+    texts |= {folder / "boards" / f"{name}.md": boards.page(name, path, root) for name, path in held.items()}
+    texts[folder / "boards" / "index.md"] = boards.index(held)
+    shown = staged.shown(root, folder)
+    links = Links(root, docs, shown)
+    for source, page in shown.items():
+        if source.suffix == ".md":
+            text = staged.titled(source.read_text(encoding="utf-8"), source)
+            texts[page] = links.rebased(text, source, page)
+    listed = [page.relative_to(folder / "reports").with_suffix("") for page in shown.values() if page.is_relative_to(folder / "reports")]
+    tree = ["```{toctree}", ":maxdepth: 1", "", *map(str, listed), "```", ""]
+    texts[folder / "reports" / "index.md"] = "\n".join(["# Reports", "", "Reports that commands wrote, with their figures.", "", *tree])
+    for path, text in texts.items():
+        _put(path, text)
+    for path in folder.rglob("*.md"):
+        if path not in texts:  # of a component that is gone
+            path.unlink()
+    app.config.tailgate_links = links
+
+
+def _read(app: Sphinx, docname: str, content: list[str]) -> None:
+    """Put in sections of README, and mend links that leave the folder of pages."""
+    if docname.startswith(f"{GENERATED}/"):
+        return
+    path = Path(app.env.doc2path(docname)).resolve()
+    if path.suffix != ".md":
+        return
+    links: Links = app.config.tailgate_links
+    text = links.rebased(content[0], path, path)
+    readme = links.root / "README.md"
+    told = readme.read_text(encoding="utf-8")
+    content[0] = _FROM_README.sub(lambda found: links.rebased(section(told, found[1]), readme, path), text)
+
+
+class ComponentLinks(SphinxPostTransform):
+    """A component's name in code leads to its page, where it is named first on a page."""
+
+    default_priority: ClassVar[int] = 5
+
+    def run(self, **kwargs: Any) -> None:
+        docname = self.env.docname
+        if docname.startswith(f"{GENERATED}/components/"):
+            return
+        pages: dict[str, str] = self.config.tailgate_names
+        seen: set[str] = set()
+        for node in list(self.document.findall(nodes.literal)):
+            name = node.astext()
+            at = node.parent
+            inside = isinstance(at, (nodes.reference, nodes.title)) or any(isinstance(one, nodes.title) for one in (at, at.parent))
+            if name in seen or name not in pages or inside or isinstance(at.parent, nodes.reference):
+                continue
+            seen.add(name)
+            uri = self.app.builder.get_relative_uri(docname, pages[name])
+            new = nodes.reference("", "", internal=True, refuri=uri, classes=["component"])
+            node.replace_self(new)
+            new += node
+
+
+def _names(app: Sphinx) -> None:
+    """Know the page of every name that belongs to one component alone and cannot be a plain word."""
+    folder = Path(app.srcdir) / GENERATED / "components"
+    found: dict[str, str] = {}
+    for family in reversed(_FAMILIES):
+        for path in (folder / family).glob("*.md"):
+            if path.stem != "index" and (re.search(r"[_\-\d]", path.stem) or path.stem in ("kf", "rkf", "imm", "cra", "pycra", "dkf")):
+                found[path.stem] = f"{GENERATED}/components/{family}/{path.stem}"
+    app.config.tailgate_names = found
+
+
+def _draw(app: Sphinx, error: Exception | None) -> None:
+    if error is None and app.builder.name == "html" and app.config.tailgate_boards:
+        boards.draw(Path(app.srcdir).resolve().parent, Path(app.outdir) / "boards")
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Register the extension."""
+    app.add_config_value("tailgate_boards", True, "", bool)
+    app.add_config_value("tailgate_links", None, "")
+    app.add_config_value("tailgate_names", {}, "")
+    app.connect("builder-inited", _generate)
+    app.connect("builder-inited", _names, priority=600)
+    app.connect("source-read", _read)
+    app.connect("build-finished", _draw)
+    app.add_post_transform(ComponentLinks)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
