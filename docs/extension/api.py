@@ -6,7 +6,7 @@ import types
 from collections.abc import Iterator
 from typing import Any
 
-from docstrings import escaped, markdown, summary
+from docstrings import markdown, summary
 from sphinx.util.inspect import stringify_signature
 
 PACKAGES = (
@@ -52,7 +52,7 @@ def _members(cls: type, module: str) -> Iterator[str]:
             yield "\n".join([f"{INNER}{{py:method}} {name}{_signature(plain, True)}", *options, "", markdown(plain), INNER, ""])
 
 
-def _entry(package: str, name: str, thing: Any, pages: dict[type, str]) -> str:
+def _entry(package: str, name: str, thing: Any, pages: dict[type, str], seen: list[Any]) -> str:
     """Return the entry of a public name, or a link to the page of a component."""
     if inspect.isclass(thing) and thing in pages:
         return f"- `{name}`: [{pages[thing].rsplit('/', 1)[1][:-3]}](../{pages[thing]}), {summary(thing)}\n"
@@ -70,13 +70,16 @@ def _entry(package: str, name: str, thing: Any, pages: dict[type, str]) -> str:
         body = [markdown(thing) or "A function.", ""]
         head = f"{OUTER}{{py:function}} {name}{_signature(thing, True)}"
     found = [] if module == package else [f"From `{package}` as well.", ""]
-    return "\n".join([head, f":module: {module}", "", *body, *found, OUTER, ""])
+    again = [":no-index:"] if thing in seen else []
+    seen.append(thing)
+    return "\n".join([head, f":module: {module}", *again, "", *body, *found, OUTER, ""])
 
 
 def pages(components: dict[type, str]) -> dict[str, str]:
     """Return path -> Markdown of the reference; `components` has the page of each registered class."""
     out = {}
     rows = []
+    seen: list[Any] = []
     for package in (*PACKAGES, *MODULES):
         try:
             module = importlib.import_module(package)
@@ -85,7 +88,7 @@ def pages(components: dict[type, str]) -> dict[str, str]:
         except ImportError as error:  # an extra that is not installed
             out[f"{package}.md"] = f"# {package}\n\nThis reference was built where `{error.name}` is not installed.\n"
             continue
-        shown = {name: _entry(package, name, thing, components) for name, thing in held.items()}
+        shown = {name: _entry(package, name, thing, components, seen) for name, thing in held.items()}
         linked = [text for text in shown.values() if text.startswith("- ")]
         text = [f"# {package}", "", markdown(module), ""]
         if linked:

@@ -15,6 +15,8 @@ from sphinx.transforms.post_transforms import SphinxPostTransform
 
 GENERATED = "generated"
 _FROM_README = re.compile(r"<!-- from README: ([^>]+?) -->")
+_DECISIONS = "<!-- list of decisions -->"
+_LISTED = re.compile(r"generated/components/\w+/(?!index).*|generated/reports/(?!index$).*|decisions/0.*")
 _FAMILIES = ("defence", "attack", "scenario", "suite", "plant", "sensor", "detector", "filter", "mitigation", "controller", "manoeuvre")
 
 
@@ -43,8 +45,8 @@ def _generate(app: Sphinx) -> None:
             text = staged.titled(source.read_text(encoding="utf-8"), source)
             texts[page] = links.rebased(text, source, page)
     listed = [page.relative_to(folder / "reports").with_suffix("") for page in shown.values() if page.is_relative_to(folder / "reports")]
-    tree = ["```{toctree}", ":maxdepth: 1", "", *map(str, listed), "```", ""]
-    texts[folder / "reports" / "index.md"] = "\n".join(["# Reports", "", "Reports that commands wrote, with their figures.", "", *tree])
+    lines = [f"- [{name}]({name}.md)" for name in map(str, listed)]
+    texts[folder / "reports" / "index.md"] = "\n".join(["# Reports", "", "Reports that commands wrote, with their figures.", "", *lines, ""])
     for path, text in texts.items():
         _put(path, text)
     for path in folder.rglob("*.md"):
@@ -64,7 +66,17 @@ def _read(app: Sphinx, docname: str, content: list[str]) -> None:
     text = links.rebased(content[0], path, path)
     readme = links.root / "README.md"
     told = readme.read_text(encoding="utf-8")
-    content[0] = _FROM_README.sub(lambda found: links.rebased(section(told, found[1]), readme, path), text)
+    text = _FROM_README.sub(lambda found: links.rebased(section(told, found[1]), readme, path), text)
+    records = sorted(path.parent.glob("0*.md")) if _DECISIONS in text else []
+    heads = [(record.name, record.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")) for record in records]
+    content[0] = text.replace(_DECISIONS, "\n".join(f"- [{head}]({name})" for name, head in heads))
+
+
+def _aside(app: Sphinx, doctree: nodes.document) -> None:
+    """Take pages that a table or list leads to out of the side bar: it would have hundreds of lines, on every page."""
+    docname = app.env.docname
+    if _LISTED.fullmatch(docname):
+        app.env.metadata[docname]["orphan"] = True
 
 
 class ComponentLinks(SphinxPostTransform):
@@ -115,6 +127,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.connect("builder-inited", _generate)
     app.connect("builder-inited", _names, priority=600)
     app.connect("source-read", _read)
+    app.connect("doctree-read", _aside)
     app.connect("build-finished", _draw)
     app.add_post_transform(ComponentLinks)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
