@@ -134,8 +134,8 @@ def _shown(cell: dict[str, Any]) -> list[str]:
     return out
 
 
-@pytest.mark.thin(3)
-@pytest.mark.parametrize("path", TUTORIALS[::-1], ids=lambda path: path.stem)
+@pytest.mark.long
+@pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
 def test_a_tutorial_runs_to_the_outputs_that_it_shows(path: Path) -> None:
     nbclient = pytest.importorskip("nbclient", reason="the extra docs is not installed")
     nbformat = pytest.importorskip("nbformat")

@@ -1,6 +1,8 @@
 """The Sphinx extension of this site: pages from code, files and boards, links that hold, names of components that lead to their pages."""
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -11,6 +13,7 @@ import staged
 from docutils import nodes
 from links import Links, section
 from sphinx.application import Sphinx
+from sphinx.errors import ExtensionError
 from sphinx.transforms.post_transforms import SphinxPostTransform
 
 GENERATED = "generated"
@@ -18,6 +21,17 @@ _FROM_README = re.compile(r"<!-- from README: ([^>]+?) -->")
 _DECISIONS = "<!-- list of decisions -->"
 _LISTED = re.compile(r"generated/components/\w+/(?!index).*|generated/reports/(?!index$).*|decisions/0.*")
 _FAMILIES = ("defence", "attack", "scenario", "suite", "plant", "sensor", "detector", "filter", "mitigation", "controller", "manoeuvre")
+
+
+class _Held:
+    """What one step of a build leaves to later ones; worker processes inherit it."""
+
+    links: Links
+    names: dict[str, str]
+    drawing: "subprocess.Popen[str] | None" = None
+
+
+_held = _Held()
 
 
 def _put(path: Path, text: str) -> None:
@@ -38,6 +52,7 @@ def _generate(app: Sphinx) -> None:
     held = boards.published(root)
     texts |= {folder / "boards" / f"{name}.md": boards.page(name, path, root) for name, path in held.items()}
     texts[folder / "boards" / "index.md"] = boards.index(held)
+    texts[folder / "replays.md"] = boards.gallery(held)
     shown = staged.shown(root, folder)
     links = Links(root, docs, shown)
     for source, page in shown.items():
@@ -52,7 +67,7 @@ def _generate(app: Sphinx) -> None:
     for path in folder.rglob("*.md"):
         if path not in texts:  # of a component that is gone
             path.unlink()
-    app.config.tailgate_links = links
+    _held.links = links
 
 
 def _read(app: Sphinx, docname: str, content: list[str]) -> None:
@@ -62,10 +77,12 @@ def _read(app: Sphinx, docname: str, content: list[str]) -> None:
     path = Path(app.env.doc2path(docname)).resolve()
     if path.suffix != ".md":
         return
-    links: Links = app.config.tailgate_links
+    links = _held.links
     text = links.rebased(content[0], path, path)
     readme = links.root / "README.md"
     told = readme.read_text(encoding="utf-8")
+    if _FROM_README.search(text):
+        app.env.note_dependency(str(readme))
     text = _FROM_README.sub(lambda found: links.rebased(section(told, found[1]), readme, path), text)
     records = sorted(path.parent.glob("0*.md")) if _DECISIONS in text else []
     heads = [(record.name, record.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")) for record in records]
@@ -88,7 +105,7 @@ class ComponentLinks(SphinxPostTransform):
         docname = self.env.docname
         if docname.startswith(f"{GENERATED}/components/"):
             return
-        pages: dict[str, str] = self.config.tailgate_names
+        pages = _held.names
         seen: set[str] = set()
         for node in list(self.document.findall(nodes.literal)):
             name = node.astext()
@@ -111,23 +128,36 @@ def _names(app: Sphinx) -> None:
         for path in (folder / family).glob("*.md"):
             if path.stem != "index" and (re.search(r"[_\-\d]", path.stem) or path.stem in ("kf", "rkf", "imm", "cra", "pycra", "dkf")):
                 found[path.stem] = f"{GENERATED}/components/{family}/{path.stem}"
-    app.config.tailgate_names = found
+    _held.names = found
 
 
-def _draw(app: Sphinx, error: Exception | None) -> None:
-    if error is None and app.builder.name == "html" and app.config.tailgate_boards:
-        boards.draw(Path(app.srcdir).resolve().parent, Path(app.outdir) / "boards")
+def _begin(app: Sphinx) -> None:
+    """Draw the boards in a process of their own, next to the build."""
+    if app.builder.name == "html" and app.config.tailgate_boards:
+        root = Path(app.srcdir).resolve().parent
+        command = [sys.executable, boards.__file__, str(root), str(Path(app.outdir) / "boards")]
+        _held.drawing = subprocess.Popen(command, cwd=root, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+
+
+def _end(app: Sphinx, error: Exception | None) -> None:
+    drawing = _held.drawing
+    if drawing is None:
+        return
+    if error is not None:
+        drawing.kill()
+    _, said = drawing.communicate()
+    if error is None and drawing.returncode:
+        raise ExtensionError(f"the boards were not drawn: {said}")
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the extension."""
     app.add_config_value("tailgate_boards", True, "", bool)
-    app.add_config_value("tailgate_links", None, "")
-    app.add_config_value("tailgate_names", {}, "")
     app.connect("builder-inited", _generate)
     app.connect("builder-inited", _names, priority=600)
     app.connect("source-read", _read)
     app.connect("doctree-read", _aside)
-    app.connect("build-finished", _draw)
+    app.connect("builder-inited", _begin, priority=400)
+    app.connect("build-finished", _end)
     app.add_post_transform(ComponentLinks)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
