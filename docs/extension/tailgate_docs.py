@@ -12,6 +12,7 @@ import components
 import staged
 from docutils import nodes
 from links import Links, section
+from pygments.lexers.special import TextLexer
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 from sphinx.transforms.post_transforms import SphinxPostTransform
@@ -28,6 +29,7 @@ class _Held:
 
     links: Links
     names: dict[str, str]
+    bars: ClassVar[dict[tuple[str, Any], str]] = {}
     drawing: "subprocess.Popen[str] | None" = None
 
 
@@ -131,6 +133,22 @@ def _names(app: Sphinx) -> None:
     _held.names = found
 
 
+def _navigate(app: Sphinx, pagename: str, templatename: str, context: dict[str, Any], doctree: Any) -> None:
+    """Make the side bar once for all pages of a folder that are not in it: it takes a tenth of a second a page."""
+    told = app.env.metadata.get(pagename, {})
+    if "toctree" not in context or (pagename in app.env.found_docs and "orphan" not in told):
+        return
+    make, folder = context["toctree"], pagename.rpartition("/")[0]
+
+    def toctree(**kwargs: Any) -> str:
+        key = (folder, tuple(sorted(kwargs.items())))
+        if key not in _held.bars:
+            _held.bars[key] = make(**kwargs)
+        return _held.bars[key]
+
+    context["toctree"] = toctree
+
+
 def _begin(app: Sphinx) -> None:
     """Draw the boards in a process of their own, next to the build."""
     if app.builder.name == "html" and app.config.tailgate_boards:
@@ -153,10 +171,12 @@ def _end(app: Sphinx, error: Exception | None) -> None:
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the extension."""
     app.add_config_value("tailgate_boards", True, "", bool)
+    app.add_lexer("csv", TextLexer)  # Pygments knows none
     app.connect("builder-inited", _generate)
     app.connect("builder-inited", _names, priority=600)
     app.connect("source-read", _read)
     app.connect("doctree-read", _aside)
+    app.connect("html-page-context", _navigate, priority=100)
     app.connect("builder-inited", _begin, priority=400)
     app.connect("build-finished", _end)
     app.add_post_transform(ComponentLinks)
