@@ -17,6 +17,7 @@ html_theme = "furo"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
 html_copy_source = False
+html_show_search_summary = False  # a page opened from a folder may not read others
 html_show_sourcelink = False
 html_theme_options = {"top_of_page_buttons": []}
 add_module_names = False

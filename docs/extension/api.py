@@ -6,7 +6,7 @@ import types
 from collections.abc import Iterator
 from typing import Any
 
-from docstrings import markdown, summary
+from docstrings import escaped, markdown, summary
 from sphinx.util.inspect import stringify_signature
 
 PACKAGES = (
@@ -14,6 +14,7 @@ PACKAGES = (
     "tailgate.board", "tailgate.sandbox", "tailgate.thesis", "tailgate.cli",
 )  # fmt: skip
 MODULES = ("tailgate.num",)  # without __all__, and yet what components are written with
+SHORT = 300  # characters of a value that are shown
 OUTER, INNER = "`" * 7, "`" * 6
 
 
@@ -35,6 +36,11 @@ def _signature(thing: Any, typed: bool) -> str:
     if not typed:
         plain = [p.replace(annotation=p.empty) for p in signature.parameters.values()]
         signature = signature.replace(parameters=plain, return_annotation=signature.empty)
+    first = next(iter(signature.parameters), "")
+    if first in ("self", "cls"):
+        signature = signature.replace(parameters=list(signature.parameters.values())[1:])
+    if str(signature) == "(*args, **kwargs)":  # a base class that is never made
+        return ""
     text = stringify_signature(signature, unqualified_typehints=True, short_literals=True)
     return text if "<" not in text else stringify_signature(signature, show_annotation=False)
 
@@ -58,9 +64,9 @@ def _entry(package: str, name: str, thing: Any, pages: dict[type, str], seen: li
         return f"- `{name}`: [{pages[thing].rsplit('/', 1)[1][:-3]}](../{pages[thing]}), {summary(thing)}\n"
     home = getattr(thing, "__module__", package) or package
     if not (inspect.isclass(thing) or inspect.isfunction(thing)) or not home.startswith("tailgate"):
-        value = thing if isinstance(thing, (str, int, float, tuple)) else None
-        shown = f"\n\nValue: `{value!r}`" if value is not None and len(repr(value)) < 80 else ""
-        return "\n".join([f"{OUTER}{{py:data}} {name}", f":module: {package}", "", shown.strip() or "See the source.", OUTER, ""])
+        text = str(thing).replace("tailgate.", "").replace("typing.", "")
+        said = f"`{text}`" if len(text) < SHORT else f"A value of {escaped(type(thing).__name__)}."
+        return "\n".join([f"{OUTER}{{py:data}} {name}", f":module: {package}", "", said, OUTER, ""])
     module = home if getattr(importlib.import_module(home), name, None) is thing else package
     if inspect.isclass(thing):
         kind = "exception" if issubclass(thing, Exception) else "class"
@@ -69,10 +75,9 @@ def _entry(package: str, name: str, thing: Any, pages: dict[type, str], seen: li
     else:
         body = [markdown(thing) or "A function.", ""]
         head = f"{OUTER}{{py:function}} {name}{_signature(thing, True)}"
-    found = [] if module == package else [f"From `{package}` as well.", ""]
     again = [":no-index:"] if thing in seen else []
     seen.append(thing)
-    return "\n".join([head, f":module: {module}", *again, "", *body, *found, OUTER, ""])
+    return "\n".join([head, f":module: {module}", *again, "", *body, OUTER, ""])
 
 
 def pages(components: dict[type, str]) -> dict[str, str]:
@@ -90,7 +95,7 @@ def pages(components: dict[type, str]) -> dict[str, str]:
             continue
         shown = {name: _entry(package, name, thing, components, seen) for name, thing in held.items()}
         linked = [text for text in shown.values() if text.startswith("- ")]
-        text = [f"# {package}", "", markdown(module), ""]
+        text = [f"# {package}", "", markdown(module), "", f"These names are imported from `{package}`.", ""]
         if linked:
             text += ["## Components", "", "Each has a page of its parameters.", "", *linked, ""]
         text += ["## Names", "", *(text for text in shown.values() if not text.startswith("- "))]

@@ -160,11 +160,11 @@ class Pages:
     @staticmethod
     def _index(title: str, about: str, rows: list[tuple[str, str]]) -> str:
         table = [f"| [{name}]({name}.md) | {said} |" for name, said in rows]
-        return "\n".join([f"# {title}", "", about, "", "| name | what it is |", "|---|---|", *table, ""])
+        return "\n".join([f"# All {title.lower()}", "", about, "", "| name | what it is |", "|---|---|", *table, ""])
 
     def _component(self, entry: Entry) -> str:
         file, line = where(entry.cls, self.root)
-        facts = [("one of the", f"[{TITLES[entry.family][0].lower()}](index.md)"), ("version", str(entry.version)), ("class", f"`{entry.cls.__module__}.{entry.cls.__qualname__}`")]
+        facts = [("family", f"[{TITLES[entry.family][0].lower()}](index.md)"), ("version", str(entry.version)), ("class", f"`{entry.cls.__module__}.{entry.cls.__qualname__}`")]
         facts.append(("file", f"`{file}`, line {line}"))
         if entry.reference:
             facts.append(("reference", escaped(entry.reference)))
@@ -207,7 +207,7 @@ class Pages:
             known = next((n for n, e in self.entries[family].items() if e.cls is type(part)), None)
             shown = ", ".join(f"`{key}` {json.dumps(as_data(getattr(part, key)))}" for key in fields_of(type(part)))
             text.append(f"| {family} | " + (f"[{known}](../{family}/{known}.md)" if known else type(part).__name__) + f" | {cell(shown)} |")
-        text += ["", f"One of the [scenarios](index.md). An episode has {place.horizon} steps of {place.brief().model.dt:g} s.", ""]
+        text += ["", f"One of all [scenarios](index.md). An episode has {place.horizon} steps of {place.brief().model.dt:g} s.", ""]
         if place.truth:
             text += ["What defence and attacker do not know, `truth`:", "", "```json", json.dumps(as_data(place.truth)), "```", ""]
         rows = [f"| `{key}` | `{cell(json.dumps(as_data(getattr(place.threat_model, key))))}` |" for key in fields_of(type(place.threat_model))]
@@ -227,7 +227,7 @@ class Pages:
             return ", ".join(out) or "-"
 
         rows = [
-            ("one of the", "[suites](index.md)"), ("scenarios", linked("scenario", suite.scenarios)), ("doses [steps]", ", ".join(map(str, suite.doses)) or "-"),
+            ("kind", "[suite](index.md)"), ("scenarios", linked("scenario", suite.scenarios)), ("doses [steps]", ", ".join(map(str, suite.doses)) or "-"),
             ("seeds", str(suite.seeds)), ("defences", linked("defence", suite.defences)), ("attacks", linked("attack", suite.attacks)),
             ("robustness scenarios", linked("scenario", suite.robustness)),
         ]  # fmt: skip
