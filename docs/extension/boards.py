@@ -47,7 +47,7 @@ def page(name: str, path: Path, root: Path) -> str:
     file = path.relative_to(root)
     made = f"[how it was made](../../results/{name}.md), [scoring](../../scoring.md)"
     return "\n".join([
-        f"# {name}", "", escaped(board["suite"]["about"]), "",
+        f"# {name} (board)", "", escaped(board["suite"]["about"]), "",
         f"{_whole(name, f'Open the whole board of {name}')}: maps, curves, every entry, replays.", "",
         f"The suite is [{name}](../components/suite/{name}.md), the file `{file}`; {made}. Those that take a rank:", "",
         head_of(board, _ranked(board)), "",

@@ -176,7 +176,7 @@ class Pages:
             facts.append(("sentinel", escaped(entry.sentinel)))
         places = self._played(entry)
         held: object = sys.modules[entry.cls.__module__] if entry.family == "learner" else entry.cls  # a module is one algorithm
-        text = [f"# {entry.name}", "", markdown(held), "", "| | |", "|---|---|", *(f"| {k} | {cell(v)} |" for k, v in facts), ""]
+        text = [f"# {entry.name} ({entry.family})", "", markdown(held), "", "| | |", "|---|---|", *(f"| {k} | {cell(v)} |" for k, v in facts), ""]
         text += ["## Parameters", "", *_parameters(getattr(held, "Config", entry.cls)), "## Use", "", *_usage(entry, places)]
         text += self._links("Played in", "scenario", places if entry.family not in ("defence", "attack") else [])
         text += self._links("On the suites", "suite", self._listed(entry))
@@ -201,13 +201,13 @@ class Pages:
         return [name for name, texts in held.items() if any(re.split("[:,]", str(text))[0] == entry.name for text in texts)]
 
     def _scenario(self, name: str, place: Scenario) -> str:
-        text = [f"# {name}", "", escaped(place.about), "", "## Parts", "", "| part | component | parameters |", "|---|---|---|"]
+        text = [f"# {name} (scenario)", "", escaped(place.about), "", "## Parts", "", "| part | component | parameters |", "|---|---|---|"]
         for family in ("plant", "sensor", "controller", "manoeuvre"):
             part = getattr(place, family)
             known = next((n for n, e in self.entries[family].items() if e.cls is type(part)), None)
             shown = ", ".join(f"`{key}` {json.dumps(as_data(getattr(part, key)))}" for key in fields_of(type(part)))
             text.append(f"| {family} | " + (f"[{known}](../{family}/{known}.md)" if known else type(part).__name__) + f" | {cell(shown)} |")
-        text += ["", f"One of all [scenarios](index.md). An episode has {place.horizon} steps of {place.brief().model.dt:g} s.", ""]
+        text += ["", f"[All scenarios](index.md). An episode has {place.horizon} steps of {place.brief().model.dt:g} s.", ""]
         if place.truth:
             text += ["What defence and attacker do not know, `truth`:", "", "```json", json.dumps(as_data(place.truth)), "```", ""]
         rows = [f"| `{key}` | `{cell(json.dumps(as_data(getattr(place.threat_model, key))))}` |" for key in fields_of(type(place.threat_model))]
@@ -233,7 +233,7 @@ class Pages:
         ]  # fmt: skip
         table = [f"| {key} | {cell(value)} |" for key, value in rows]
         use = ["```console", f"tailgate leaderboard run {name} --out boards", "```", ""]
-        return "\n".join([f"# {name}", "", escaped(suite.about), "", "| | |", "|---|---|", *table, "", "## Use", "", *use])
+        return "\n".join([f"# {name} (suite)", "", escaped(suite.about), "", "| | |", "|---|---|", *table, "", "## Use", "", *use])
 
 
 def _metrics() -> str:
