@@ -22,3 +22,4 @@ html_show_sourcelink = False
 html_theme_options = {"top_of_page_buttons": []}
 add_module_names = False
 viewcode_line_numbers = True
+viewcode_follow_imported_members = False  # pages name the module that defines

@@ -4,8 +4,10 @@ import json
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import pytest
 
@@ -151,18 +153,46 @@ def test_a_tutorial_runs_to_the_outputs_that_it_shows(path: Path) -> None:
             assert _shown(new) == _shown(old), old.source
 
 
-@pytest.mark.long
-def test_the_site_builds_strictly_and_asks_for_nothing(tmp_path: Path) -> None:
-    """Without boards, which tests of their own draw: a warning, such as a broken link, ends the build."""
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, built strictly without boards, which tests of their own draw."""
     for name in ("sphinx", "furo", "myst_nb", "numpydoc"):
         pytest.importorskip(name, reason="the extra docs is not installed")
+    folder = tmp_path_factory.mktemp("docs")
     command = [sys.executable, "-m", "sphinx", "--builder", "html", "--fail-on-warning", "--keep-going", "--quiet", "--jobs", "2"]
-    command += ["-D", "tailgate_boards=0", "--doctree-dir", str(tmp_path / "doctrees"), str(DOCS), str(tmp_path / "site")]
+    command += ["-D", "tailgate_boards=0", "--doctree-dir", str(folder / "doctrees"), str(DOCS), str(folder / "site")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    pages = sorted((tmp_path / "site").rglob("*.html"))
+    return (folder / "site").resolve()
+
+
+@pytest.mark.long
+def test_links_of_the_built_site_lead_somewhere_and_none_loads_from_the_net(site: Path) -> None:
+    pages = sorted(site.rglob("*.html"))
+    texts = {page: page.read_text(encoding="utf-8") for page in pages}
+    ids = {page: set(re.findall(r'\bid="([^"]+)"', text)) for page, text in texts.items()}
     assert len(pages) > 300
-    for page in pages:
-        text = page.read_text(encoding="utf-8")
-        asked = re.findall(r"<(?:script|link|img|iframe)\b[^>]*?\b(?:src|href)=\"((?:https?:)?//[^\"]+)", text)
-        assert asked == [], page
+    for page, text in texts.items():
+        loaded = re.findall(r'<(?:script|link|img|iframe|source)\b[^>]*?\b(?:src|href)="([^"]+)', text)
+        assert not [name for name in loaded if "//" in name], page
+        for name, _, anchor in (unquote(found).partition("#") for found in {*loaded, *re.findall(r'<a\b[^>]*?\bhref="([^"]+)', text)}):
+            at = (page.parent / name.partition("?")[0]).resolve() if name else page
+            if "://" in name or name.startswith(("mailto:", "data:")) or at.is_relative_to(site / "boards"):
+                continue
+            assert at.is_file(), f"{page}: {name}"
+            assert not anchor or at not in ids or anchor in ids[at], f"{page}: {name}#{anchor}"
+
+
+@pytest.mark.long
+@pytest.mark.page
+def test_search_works_from_the_folder(site: Path, browser: Any, asked: Any) -> None:
+    for width in (400, 1300):
+        browser.set_window_size(width, 900)
+        asked()
+        browser.get((site / "search.html").as_uri() + "?q=chi2_kf")
+        deadline = time.monotonic() + 20
+        while not (found := browser.find_elements("css selector", "#search-results li a")) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        assert found[0].text.startswith("chi2_kf")
+        assert all(address.startswith("file:") for address in asked())
+        assert browser.execute_script("return document.documentElement.scrollWidth <= document.documentElement.clientWidth")

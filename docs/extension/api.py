@@ -67,6 +67,9 @@ def _entry(package: str, name: str, thing: Any, pages: dict[type, str], seen: li
         text = str(thing).replace("tailgate.", "").replace("typing.", "")
         said = f"`{text}`" if len(text) < SHORT else f"A value of {escaped(type(thing).__name__)}."
         return "\n".join([f"{OUTER}{{py:data}} {name}", f":module: {package}", "", said, OUTER, ""])
+    if thing in seen:
+        return f"- `{name}`: the same as {{py:obj}}`{home}.{name}`\n"
+    seen.append(thing)
     module = home if getattr(importlib.import_module(home), name, None) is thing else package
     if inspect.isclass(thing):
         kind = "exception" if issubclass(thing, Exception) else "class"
@@ -75,9 +78,7 @@ def _entry(package: str, name: str, thing: Any, pages: dict[type, str], seen: li
     else:
         body = [markdown(thing) or "A function.", ""]
         head = f"{OUTER}{{py:function}} {name}{_signature(thing, True)}"
-    again = [":no-index:"] if thing in seen else []
-    seen.append(thing)
-    return "\n".join([head, f":module: {module}", *again, "", *body, OUTER, ""])
+    return "\n".join([head, f":module: {module}", "", *body, OUTER, ""])
 
 
 def pages(components: dict[type, str]) -> dict[str, str]:
@@ -97,7 +98,7 @@ def pages(components: dict[type, str]) -> dict[str, str]:
         linked = [text for text in shown.values() if text.startswith("- ")]
         text = [f"# {package}", "", markdown(module), "", f"These names are imported from `{package}`.", ""]
         if linked:
-            text += ["## Components", "", "Each has a page of its parameters.", "", *linked, ""]
+            text += ["## Elsewhere", "", "Components have a page of their parameters each.", "", *linked, ""]
         text += ["## Names", "", *(text for text in shown.values() if not text.startswith("- "))]
         out[f"{package}.md"] = "\n".join(text)
         rows.append(f"| [{package}]({package}.md) | {summary(module)} | {len(names)} |")

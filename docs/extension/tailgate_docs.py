@@ -133,6 +133,11 @@ def _names(app: Sphinx) -> None:
     _held.names = found
 
 
+def _keep_outputs(app: Sphinx, *_: Any) -> None:
+    """Keep the notebooks' pictures with the doctrees: by default they would lie next to the folder of the site."""
+    app.env.mystnb_config = app.env.mystnb_config.copy(output_folder=str(Path(app.doctreedir) / "notebooks"))  # type: ignore[attr-defined]
+
+
 def _navigate(app: Sphinx, pagename: str, templatename: str, context: dict[str, Any], doctree: Any) -> None:
     """Make the side bar once for all pages of a folder that are not in it: it takes a tenth of a second a page."""
     told = app.env.metadata.get(pagename, {})
@@ -176,6 +181,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.connect("builder-inited", _names, priority=600)
     app.connect("source-read", _read)
     app.connect("doctree-read", _aside)
+    app.connect("env-before-read-docs", _keep_outputs)
     app.connect("html-page-context", _navigate, priority=100)
     app.connect("builder-inited", _begin, priority=400)
     app.connect("build-finished", _end)
