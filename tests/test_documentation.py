@@ -92,6 +92,7 @@ def test_every_component_has_a_page_with_its_parameters(extension: Path) -> None
 
     from tailgate.core.registry import find
     from tailgate.core.schema import fields_of
+    from tailgate.play.metrics import METRICS
 
     made = Pages(ROOT)
     pages = made.all()
@@ -106,7 +107,7 @@ def test_every_component_has_a_page_with_its_parameters(extension: Path) -> None
     gate = pages["defence/chi2_kf.md"]
     assert "| `eta` | gate on r' S^-1 r | - | number above 0 | `20.0` |" in gate and "estimators/detectors/chi_square.py" in gate
     assert "| `gain` |" in gate and "`varying`, `steady`" in gate
-    assert {f"scenario/{name}.md" for name in made.scenarios} | {f"suite/{name}.md" for name in made.suites} <= set(pages)
+    assert {f"metric/{name}.md" for name in METRICS} | {f"scenario/{name}.md" for name in made.scenarios} | {f"suite/{name}.md" for name in made.suites} <= set(pages)
 
 
 def test_links_of_a_page_that_is_shown_elsewhere(extension: Path, tmp_path: Path) -> None:

@@ -89,8 +89,8 @@ def _parameters(cls: type) -> list[str]:
     return ["| parameter | meaning | unit | range | default |", "|---|---|---|---|---|", *rows, ""]
 
 
-def where(cls: type, root: Path) -> tuple[str, int]:
-    """Return file, as the repository has it, and line of a class."""
+def where(cls: Any, root: Path) -> tuple[str, int]:
+    """Return file, as the repository has it, and line of a class or function."""
     path = Path(inspect.getfile(cls)).resolve()
     return str(path.relative_to(root)), inspect.getsourcelines(cls)[1]
 
@@ -154,7 +154,10 @@ class Pages:
         out["scenario/index.md"] = self._index("Scenarios", about, [(n, cell(escaped(s.about))) for n, s in self.scenarios.items()])
         about = "A suite is scenarios, doses, attacks and gates, under a name with a version: what a board plays."
         out["suite/index.md"] = self._index("Suites", about, [(n, cell(escaped(s.about))) for n, s in self.suites.items()])
-        out["metrics.md"] = _metrics()
+        for name in METRICS:
+            out[f"metric/{name}.md"] = self._metric(name)
+        about = "Columns of a row: what one episode came to. Where a quantity is undefined, the row says `null`."
+        out["metric/index.md"] = self._index("Metrics", about, [(n, f"{summary(f)} {cell(escaped(f'[{UNITS[n]}]'))}") for n, f in METRICS.items()])
         return out
 
     @staticmethod
@@ -217,6 +220,15 @@ class Pages:
         text += self._links("On the suites", "suite", [n for n, suite in self.suites.items() if name in (*suite.scenarios, *suite.robustness)])
         return "\n".join(text)
 
+    def _metric(self, name: str) -> str:
+        function = METRICS[name]
+        file, line = where(function, self.root)
+        facts = [("family", "[metrics](index.md)"), ("unit", escaped(UNITS[name])), ("file", f"`{file}`, line {line}")]
+        use = ["```python", "import tailgate", "", 'rows = tailgate.evaluate("quick-v0", defences=["kf"], seeds=5)', f'[row["{name}"] for row in rows]', "```", ""]
+        entry = described("function", f"{name}(trace)", function.__module__, "")
+        table = [f"| {key} | {value} |" for key, value in facts]
+        return "\n".join([f"# {name} (metric)", "", markdown(function), "", "| | |", "|---|---|", *table, "", "## Use", "", *use, "## Function", "", *entry])
+
     def _suite(self, name: str, suite: Suite) -> str:
         def linked(kind: str, texts: Any) -> str:
             known = self.entries.get(kind, {}) if kind != "scenario" else self.scenarios
@@ -234,10 +246,3 @@ class Pages:
         table = [f"| {key} | {cell(value)} |" for key, value in rows]
         use = ["```console", f"tailgate leaderboard run {name} --out boards", "```", ""]
         return "\n".join([f"# {name} (suite)", "", escaped(suite.about), "", "| | |", "|---|---|", *table, "", "## Use", "", *use])
-
-
-def _metrics() -> str:
-    rows = [f"| `{name}` | {cell(escaped(' '.join((inspect.getdoc(f) or '').split())))} | {escaped(UNITS[name])} |" for name, f in METRICS.items()]
-    about = "Columns of a row: what one episode came to. Where a quantity is undefined, the row says `null`."
-    use = ["```python", "import tailgate", "", 'rows = tailgate.evaluate("quick-v0", defences=["kf"], seeds=5)', 'rows.to_pandas()[["attack", "min_gap", "crashed"]]', "```"]
-    return "\n".join(["# Metrics", "", about, "", "| metric | meaning | unit |", "|---|---|---|", *rows, "", "## Use", "", *use, ""])

@@ -21,7 +21,7 @@ GENERATED = "generated"
 _FROM_README = re.compile(r"<!-- from README: ([^>]+?) -->")
 _DECISIONS = "<!-- list of decisions -->"
 _LISTED = re.compile(r"generated/components/\w+/(?!index).*|generated/reports/(?!index$).*|decisions/0.*")
-_FAMILIES = ("defence", "attack", "scenario", "suite", "plant", "sensor", "detector", "filter", "mitigation", "controller", "manoeuvre")
+_FAMILIES = ("defence", "attack", "scenario", "suite", "metric", "plant", "sensor", "detector", "filter", "mitigation", "controller", "manoeuvre")
 
 
 class _Held:
