@@ -6,7 +6,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 from urllib.parse import unquote
 
 import pytest
@@ -87,14 +87,15 @@ def extension(monkeypatch: pytest.MonkeyPatch) -> Path:
     return DOCS / "extension"
 
 
-def test_every_component_has_a_page_with_its_parameters(extension: Path) -> None:
+@pytest.mark.parametrize("learners", [False, pytest.param(True, marks=pytest.mark.long)])  # they import torch
+def test_every_component_has_a_page_with_its_parameters(extension: Path, learners: bool) -> None:
     from components import Pages  # type: ignore[import-not-found]
 
-    from tailgate.core.registry import find
+    from tailgate.core.registry import Family, find
     from tailgate.core.schema import fields_of
     from tailgate.play.metrics import METRICS
 
-    made = Pages(ROOT)
+    made = Pages(ROOT, [family for family in get_args(Family) if (family == "learner") <= learners])
     pages = made.all()
     for family, group in made.entries.items():
         for name in group:
@@ -108,6 +109,62 @@ def test_every_component_has_a_page_with_its_parameters(extension: Path) -> None
     assert "| `eta` | gate on r' S^-1 r | - | number above 0 | `20.0` |" in gate and "estimators/detectors/chi_square.py" in gate
     assert "| `gain` |" in gate and "`varying`, `steady`" in gate
     assert {f"metric/{name}.md" for name in METRICS} | {f"scenario/{name}.md" for name in made.scenarios} | {f"suite/{name}.md" for name in made.suites} <= set(pages)
+
+
+@pytest.mark.parametrize("package", ["tailgate", "tailgate.core", "tailgate.board", "tailgate.num"])
+def test_every_public_name_is_in_the_reference(extension: Path, package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    import api  # type: ignore[import-not-found]
+
+    monkeypatch.setattr(api, "PACKAGES", (package,) if package not in api.MODULES else ())
+    monkeypatch.setattr(api, "MODULES", (package,) if package in api.MODULES else ())
+    pages = api.pages({})
+    assert set(pages) == {"index.md", f"{package}.md"}
+    told = set(re.findall(r"^`{7}\{py:\w+\} (\w+)", pages[f"{package}.md"], flags=re.M))
+    assert told == set(api.public(package)) and len(told) > 4
+
+
+def test_docstrings_are_markdown(extension: Path) -> None:
+    from docstrings import markdown, summary  # type: ignore[import-not-found]
+
+    def sample(x: float) -> float:
+        """Return x_k * 2 <= y, as `a*b`.
+
+        The law is
+
+            y = 2 * x_k
+
+        Parameters
+        ----------
+        x : float
+            Speed [m/s], of *one* car.
+
+        Raises
+        ------
+        InputError
+            If it is negative.
+        """
+        return 2 * x
+
+    assert summary(sample) == r"Return x\_k \* 2 \<= y, as `a*b`."
+    said = markdown(sample)
+    assert "\n    y = 2 * x_k" in said
+    assert r"- `x` : float: Speed \[m/s\], of \*one\* car." in said and "**Raises**" in said and "- InputError: If it is negative." in said
+
+
+@pytest.mark.long
+def test_the_gallery_leads_to_replays_that_are_drawn(extension: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import boards  # type: ignore[import-not-found]
+
+    one = {"quick-v1": ROOT / "results/quick-v1/board.json.xz"}
+    monkeypatch.setattr(boards, "published", lambda root: one)
+    monkeypatch.setattr(boards, "WHOLE", ())
+    monkeypatch.chdir(ROOT)
+    boards.draw(ROOT, tmp_path / "boards")
+    links = re.findall(r'href="\.\./boards/([^"]+)"', boards.gallery(one))
+    assert len(links) == 2 and all((tmp_path / "boards" / link).is_file() for link in links)
+    page = boards.page("quick-v1", one["quick-v1"], ROOT)
+    assert "| rkf | measurements | 1 |" in page and (tmp_path / "boards/quick-v1/index.html").is_file()
+    assert "boards/quick-v1/index.html" in page and "[quick-v1](quick-v1.md)" in boards.index(one)
 
 
 def test_links_of_a_page_that_is_shown_elsewhere(extension: Path, tmp_path: Path) -> None:

@@ -87,14 +87,15 @@ def pages(components: dict[type, str]) -> dict[str, str]:
     rows = []
     seen: list[Any] = []
     for package in (*PACKAGES, *MODULES):
-        try:
-            module = importlib.import_module(package)
-            names = public(package)
-            held = {name: getattr(module, name) for name in names}
-        except ImportError as error:  # an extra that is not installed
-            out[f"{package}.md"] = f"# {package}\n\nThis reference was built where `{error.name}` is not installed.\n"
-            continue
-        shown = {name: _entry(package, name, thing, components, seen) for name, thing in held.items()}
+        module, names = importlib.import_module(package), public(package)
+        shown: dict[str, str] = {}
+        for name in names:
+            try:
+                thing = getattr(module, name)
+            except ImportError as error:  # of an extra
+                shown[name] = f"- `{name}` could not be imported where this page was built: {escaped(str(error))}\n"
+                continue
+            shown[name] = _entry(package, name, thing, components, seen)
         linked = [text for text in shown.values() if text.startswith("- ")]
         text = [f"# {package}", "", markdown(module), "", f"These names are imported from `{package}`.", ""]
         if linked:

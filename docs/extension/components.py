@@ -4,7 +4,7 @@ import inspect
 import json
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -131,11 +131,11 @@ def _usage(entry: Entry, scenarios: list[str]) -> list[str]:
 class Pages:
     """All pages of components, as paths below a folder and their texts."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, families: Sequence[Family] = get_args(Family)) -> None:
         self.root = root
         self.scenarios: dict[str, Scenario] = {name: load_scenario(name) for name in list_scenarios()}
         self.suites: dict[str, Suite] = {name: load_suite(name) for name in list_suites()}
-        self.entries = {family: entries(family) for family in get_args(Family)}
+        self.entries = {family: entries(family) for family in families}
 
     def all(self) -> dict[str, str]:
         """Return path -> Markdown of every page."""

@@ -56,7 +56,7 @@ def _generate(app: Sphinx) -> None:
     texts[folder / "boards" / "index.md"] = boards.index(held)
     texts[folder / "replays.md"] = boards.gallery(held)
     shown = staged.shown(root, folder)
-    links = Links(root, docs, shown)
+    links = Links(root, docs, shown | {root / "README.md": docs / "index.md"})
     for source, page in shown.items():
         if source.suffix == ".md":
             text = staged.titled(source.read_text(encoding="utf-8"), source)
