@@ -13,6 +13,7 @@ exclude_patterns = ["extension", "images"]
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 4
 nb_execution_mode = "off"  # tests execute the notebooks; pages show what they hold
+nb_merge_streams = True
 html_theme = "furo"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
