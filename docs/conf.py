@@ -8,7 +8,7 @@ sys.path.insert(0, str(Path(__file__).parent / "extension"))
 project = "Tailgate"
 html_title = "Tailgate"
 copyright = "The Tailgate developers, MIT licence"
-extensions = ["myst_nb", "sphinx.ext.viewcode", "tailgate_docs"]
+extensions = ["myst_nb", "sphinx.ext.viewcode", "tailgate_docs.site"]
 exclude_patterns = ["extension", "images"]
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 4

@@ -89,7 +89,7 @@ def extension(monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("learners", [False, pytest.param(True, marks=pytest.mark.long)])  # they import torch
 def test_every_component_has_a_page_with_its_parameters(extension: Path, learners: bool) -> None:
-    from components import Pages  # type: ignore[import-not-found]
+    from tailgate_docs.components import Pages  # type: ignore[import-not-found]
 
     from tailgate.core.registry import Family, find
     from tailgate.core.schema import fields_of
@@ -113,7 +113,7 @@ def test_every_component_has_a_page_with_its_parameters(extension: Path, learner
 
 @pytest.mark.parametrize("package", ["tailgate", "tailgate.core", "tailgate.board", "tailgate.num"])
 def test_every_public_name_is_in_the_reference(extension: Path, package: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    import api  # type: ignore[import-not-found]
+    from tailgate_docs import api  # type: ignore[import-not-found]
 
     monkeypatch.setattr(api, "PACKAGES", (package,) if package not in api.MODULES else ())
     monkeypatch.setattr(api, "MODULES", (package,) if package in api.MODULES else ())
@@ -124,7 +124,7 @@ def test_every_public_name_is_in_the_reference(extension: Path, package: str, mo
 
 
 def test_docstrings_are_markdown(extension: Path) -> None:
-    from docstrings import markdown, summary  # type: ignore[import-not-found]
+    from tailgate_docs.docstrings import markdown, summary  # type: ignore[import-not-found]
 
     def sample(x: float) -> float:
         """Return x_k * 2 <= y, as `a*b`.
@@ -153,7 +153,7 @@ def test_docstrings_are_markdown(extension: Path) -> None:
 
 @pytest.mark.long
 def test_the_gallery_leads_to_replays_that_are_drawn(extension: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import boards  # type: ignore[import-not-found]
+    from tailgate_docs import boards  # type: ignore[import-not-found]
 
     one = {"quick-v1": ROOT / "results/quick-v1/board.json.xz"}
     monkeypatch.setattr(boards, "published", lambda root: one)
@@ -168,7 +168,7 @@ def test_the_gallery_leads_to_replays_that_are_drawn(extension: Path, tmp_path: 
 
 
 def test_links_of_a_page_that_is_shown_elsewhere(extension: Path, tmp_path: Path) -> None:
-    from links import Links, section  # type: ignore[import-not-found]
+    from tailgate_docs.links import Links, section  # type: ignore[import-not-found]
 
     root = tmp_path.resolve()
     docs, shown = root / "docs", root / "docs/generated/report.md"

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
-from docstrings import escaped, markdown, summary
 from pydantic import TypeAdapter
 from pydantic.errors import PydanticUserError
 
@@ -16,6 +15,8 @@ from tailgate.core.registry import Entry, Family, entries
 from tailgate.core.scenario import Scenario, Suite, list_scenarios, list_suites, load_scenario, load_suite
 from tailgate.core.schema import as_data, fields_of
 from tailgate.play.metrics import METRICS, UNITS
+
+from .docstrings import escaped, markdown, summary
 
 TITLES: dict[str, tuple[str, str]] = {
     "defence": ("Defences", "Methods that turn what is received into an estimate, a score and an alarm."),

@@ -1,21 +1,20 @@
 """The Sphinx extension of this site: pages from code, files and boards, links that hold, names of components that lead to their pages."""
 
+import os
 import re
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any, ClassVar
 
-import api
-import boards
-import components
-import staged
 from docutils import nodes
-from links import Links, section
 from pygments.lexers.special import TextLexer
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 from sphinx.transforms.post_transforms import SphinxPostTransform
+
+from . import api, boards, components, staged
+from .links import Links, section
 
 GENERATED = "generated"
 _FROM_README = re.compile(r"<!-- from README: ([^>]+?) -->")
@@ -158,8 +157,9 @@ def _begin(app: Sphinx) -> None:
     """Draw the boards in a process of their own, next to the build."""
     if app.builder.name == "html" and app.config.tailgate_boards:
         root = Path(app.srcdir).resolve().parent
-        command = [sys.executable, boards.__file__, str(root), str(Path(app.outdir) / "boards")]
-        _held.drawing = subprocess.Popen(command, cwd=root, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        command = [sys.executable, "-m", boards.__name__, str(root), str(Path(app.outdir) / "boards")]
+        paths = os.pathsep.join(path for path in (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH")) if path)
+        _held.drawing = subprocess.Popen(command, cwd=root, env=os.environ | {"PYTHONPATH": paths}, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
 
 def _end(app: Sphinx, error: Exception | None) -> None:

@@ -1,6 +1,6 @@
 """The published boards, drawn by the package itself, and pages that lead to them.
 
-As a program, `python boards.py ROOT OUT`, it draws all boards while Sphinx builds the rest.
+As a program, `python -m tailgate_docs.boards ROOT OUT`, it draws all boards while Sphinx builds the rest.
 """
 
 import json
@@ -8,12 +8,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from docstrings import escaped
-
 from tailgate.board.attachments import Attachments
 from tailgate.board.files import load
 from tailgate.board.head import markdown as head_of
 from tailgate.site.build import build_site, slug
+
+from .docstrings import escaped
 
 WHOLE = ("quick-v1",)  # boards with a replay for each entry; of others for the first of each class
 

@@ -6,8 +6,9 @@ import types
 from collections.abc import Iterator
 from typing import Any
 
-from docstrings import escaped, markdown, summary
 from sphinx.util.inspect import stringify_signature
+
+from .docstrings import escaped, markdown, summary
 
 PACKAGES = (
     "tailgate", "tailgate.core", "tailgate.envs", "tailgate.envs.torch", "tailgate.estimators", "tailgate.agents", "tailgate.evaluation",
