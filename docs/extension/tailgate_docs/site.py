@@ -81,10 +81,10 @@ def _read(app: Sphinx, docname: str, content: list[str]) -> None:
     links = _held.links
     text = links.rebased(content[0], path, path)
     readme = links.root / "README.md"
-    told = readme.read_text(encoding="utf-8")
+    whole = readme.read_text(encoding="utf-8")
     if _FROM_README.search(text):
         app.env.note_dependency(str(readme))
-    text = _FROM_README.sub(lambda found: links.rebased(section(told, found[1]), readme, path), text)
+    text = _FROM_README.sub(lambda found: links.rebased(section(whole, found[1]), readme, path), text)
     records = sorted(path.parent.glob("0*.md")) if _DECISIONS in text else []
     heads = [(record.name, record.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")) for record in records]
     content[0] = text.replace(_DECISIONS, "\n".join(f"- [{head}]({name})" for name, head in heads))
@@ -139,8 +139,8 @@ def _keep_outputs(app: Sphinx, *_: Any) -> None:
 
 def _navigate(app: Sphinx, pagename: str, templatename: str, context: dict[str, Any], doctree: Any) -> None:
     """Make the side bar once for all pages of a folder that are not in it: it takes a tenth of a second a page."""
-    told = app.env.metadata.get(pagename, {})
-    if "toctree" not in context or (pagename in app.env.found_docs and "orphan" not in told):
+    known = app.env.metadata.get(pagename, {})
+    if "toctree" not in context or (pagename in app.env.found_docs and "orphan" not in known):
         return
     make, folder = context["toctree"], pagename.rpartition("/")[0]
 
