@@ -3,10 +3,14 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-long nightly lint bench crash fuzz clean
+.PHONY: demo docs test test-long nightly lint bench crash fuzz clean
 
 demo: $(VENV)/.ready  ## train an adversary against a gated Kalman filter, compare it with scripted attacks, write the page
 	$(BIN)/python train.py
+
+docs: $(VENV)/.ready  ## the documentation as a site, boards and replays with it: site/index.html, to open from the folder
+	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet --jobs 2 --doctree-dir build/doctrees docs site
+	@echo 'site/index.html'
 
 test: $(VENV)/.ready lint  ## lint, types, tests
 	$(BIN)/python -m pytest -n 2 --dist worksteal
@@ -38,8 +42,8 @@ $(VENV)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[all,dev]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[all,dev,docs]'
 	touch $@
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info
+	rm -rf $(VENV) build dist site docs/generated *.egg-info

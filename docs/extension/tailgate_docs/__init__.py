@@ -1,0 +1,1 @@
+"""What `make docs` makes from code, files and boards: the pages, and the Sphinx extension (site.py)."""
