@@ -8,14 +8,14 @@ BIN := $(VENV)/bin
 demo: $(VENV)/.ready  ## train an adversary against a gated Kalman filter, compare it with scripted attacks, write the page
 	$(BIN)/python train.py
 
-docs: $(VENV)/.ready  ## the documentation as a site, boards and replays with it: site/index.html, to open from the folder
+docs: $(VENV)/.docs  ## the documentation as a site, boards and replays with it: site/index.html, to open from the folder
 	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet --jobs 2 --doctree-dir build/doctrees docs site
 	@echo 'site/index.html'
 
 test: $(VENV)/.ready lint  ## lint, types, tests
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
-test-long: $(VENV)/.ready lint  ## and the tests that take a minute each, as before a release
+test-long: $(VENV)/.docs lint  ## and the tests that take a minute each, as before a release
 	$(BIN)/python -m pytest -n 2 --dist worksteal --long
 
 nightly: test-long fuzz crash  ## everything: the long tests and both campaigns, five hours or so
@@ -42,7 +42,11 @@ $(VENV)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[all,dev,docs]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[all,dev]'
+	touch $@
+
+$(VENV)/.docs: $(VENV)/.ready
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
 	touch $@
 
 clean:

@@ -45,12 +45,13 @@ def strict(monkeypatch):
     """Every warning is an error, Gymnasium's own too."""
 
     def shout(message, *arguments, **_):
-        raise AssertionError(f"gymnasium warns: {message % arguments if arguments else message}")
+        if "out of date" not in message:  # -v0 stays next to -v1
+            raise AssertionError(f"gymnasium warns: {message % arguments if arguments else message}")
 
     monkeypatch.setattr(gymnasium.logger, "warn", shout)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", message=".*out of date")  # -v0 stays next to -v1
+        warnings.filterwarnings("ignore", message=".*out of date")
         yield
 
 
