@@ -51,9 +51,8 @@ FACES |= {  # tasks that are worth learning: a budget, decisions that last, no s
         "scenario": "lane-keeping-v0", "defence": "chi2_kf", "value": 0.5, "interval": 20, "threat": {"budget": 60},
     },
 }  # fmt: skip
-FACES |= {
-    f"tailgate/{name}Continuous-v1": FACES[f"tailgate/{name}-v1"] | {"action": "continuous"} for name in ("CarFollowing", "Platoon", "LaneKeeping")
-}
+for _name in ("CarFollowing", "Platoon", "LaneKeeping"):
+    FACES[f"tailgate/{_name}Continuous-v1"] = FACES[f"tailgate/{_name}-v1"] | {"action": "continuous"}
 
 
 class Tally(NamedTuple):
