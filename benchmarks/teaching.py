@@ -83,6 +83,14 @@ def scripted(name: str) -> tuple[float, str]:
     return best
 
 
+def line(name: str, entry: dict[str, Any]) -> str:
+    """Return the line of an id in docs/environment.md."""
+    shown = "{:.1f}" if kind(name) == "SensorNetwork" else "{:.0%}"
+    ppo = ", ".join(shown.format(share) for share in entry["ppo"])
+    script = shown.format(entry["script"]) if kind(name) in SUITES else "-"
+    return f"| `{name}` | {shown.format(entry['random'])} | {script} | {ppo} | {max(entry['seconds']):.0f} s |"
+
+
 def main() -> None:
     """Measure, print a line for each id and write the record."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
