@@ -29,7 +29,7 @@ from tailgate.base.progress import progress
 
 ROOT = Path(__file__).parents[1]
 PAGE, RECORD = ROOT / "docs/ecosystem.md", ROOT / "benchmarks/results/ecosystem.json"
-LIMIT = 900  # seconds for a snippet
+LIMIT = 600  # seconds for a snippet
 OWN = str(ROOT)
 
 
@@ -50,7 +50,7 @@ LIBRARIES = {
     "TorchRL": Library((f"{OWN}[torchrl]",), ("torchrl", "tensordict", "torch"), True),
     "RLlib": Library((OWN, "ray[rllib]>=2.60"), ("ray", "torch")),
     "PettingZoo": Library((f"{OWN}[game]",), ("pettingzoo",), True, False),
-    "Minari": Library((OWN, "minari[hdf5]>=0.5"), ("minari",), False, False),
+    "Minari": Library((OWN, "minari[hdf5,create]>=0.5"), ("minari",), False, False),
     "Tianshou": Library((OWN, "tianshou>=2"), ("tianshou", "torch")),
     "d3rlpy": Library((OWN, "d3rlpy>=2.8"), ("d3rlpy", "torch")),
     "SBX": Library((OWN, "sbx-rl>=0.28"), ("sbx-rl", "jax", "stable-baselines3", "torch")),
