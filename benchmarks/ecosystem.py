@@ -1,4 +1,4 @@
-"""Libraries around reinforcement learning, each with its snippet of docs/ecosystem.md; writes the record that the page's table is made from.
+"""Libraries around this one, each with its snippet of docs/ecosystem.md; writes the record that the page's table is made from.
 
     python benchmarks/ecosystem.py [--library NAME ...] [--scratch DIR] [--out benchmarks/results/ecosystem.json]
 
@@ -51,7 +51,7 @@ LIBRARIES = {
     "RLlib": Library((OWN, "ray[rllib]>=2.60"), ("ray", "torch")),
     "PettingZoo": Library((f"{OWN}[game]",), ("pettingzoo",), True, False),
     "Minari": Library((OWN, "minari[hdf5,create]>=0.5"), ("minari",), False, False),
-    "Tianshou": Library((OWN, "tianshou>=2"), ("tianshou", "torch")),
+    "Tianshou": Library((OWN, "tianshou[eval]>=2"), ("tianshou", "torch")),
     "d3rlpy": Library((OWN, "d3rlpy>=2.8"), ("d3rlpy", "torch")),
     "SBX": Library((OWN, "sbx-rl>=0.28"), ("sbx-rl", "jax", "stable-baselines3", "torch")),
 }
@@ -59,7 +59,7 @@ LIBRARIES = {
 
 def snippet(name: str, page: str) -> str:
     """Return the first Python block under the library's heading."""
-    found = re.search(rf"^## {re.escape(name)}\n(?:(?!^## ).*\n)*?```python\n(.*?)^```", page, flags=re.S | re.M)
+    found = re.search(rf"^## {re.escape(name)}\n(?:(?!## )[^\n]*\n)*?```python\n(.*?)^```", page, flags=re.S | re.M)
     if found is None:
         raise unknown("library", name, LIBRARIES)
     return found[1]
@@ -74,7 +74,8 @@ def environment(library: Library, folder: Path) -> str:
     subprocess.run([sys.executable, "-m", "venv", folder], check=True)
     pinned = ["--constraint", str(ROOT / "constraints.txt")]
     for what in ([[*pinned, "torch"]] if library.torch else []) + [list(library.install)]:
-        done = subprocess.run([folder / "bin/python", "-m", "pip", "install", "--quiet", *what], capture_output=True, text=True, check=False)
+        command = [folder / "bin/python", "-m", "pip", "install", "--quiet", *what]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             return last([line for line in done.stderr.splitlines() if line.startswith("ERROR")] or done.stderr.splitlines())
     ready.touch()
