@@ -111,7 +111,7 @@ NETWORKS = [
 ]
 
 
-@pytest.mark.thin(14)
+@pytest.mark.thin(7)
 @pytest.mark.parametrize(("scenario", "defence", "attack", "threat"), PLATOONS + NETWORKS)
 def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack, threat):
     many = {"onset": 10, "end": 80} if scenario in (RESTLESS, WEAK, NOISY, LARGE, THESIS, "network-weak-v0") else {}
@@ -147,7 +147,7 @@ def test_whole_episodes_with_collisions_and_beyond_them():
         assert [fast.trace_hash(b) for b in range(20)] == [plain.trace_hash(b) for b in range(20)]
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(5)
 @pytest.mark.parametrize(("agents", "states", "sensors", "graph"), [(2, 2, 2, "path"), (7, 5, 3, "star"), (4, 9, 20, "complete")])
 @pytest.mark.parametrize("defence", ["dkf", "norm_resilient", "lasso_dkf", "consensus_kf"])
 def test_networks_of_any_size(agents, states, sensors, graph, defence):

@@ -110,7 +110,6 @@ def test_rows_of_boards_are_the_same_in_any_batch_company_and_order(
     assert verify(some, workers=2, batch=7)["counts"] == {"verified": len(some), "differs": 0, "unchecked": 0}
 
 
-@pytest.mark.long
 def test_rows_of_a_radar_a_platoon_and_a_network_are_the_same_too() -> None:
     """Filters of one car and of many agents, over the air and on wires: side by side, three at once in two processes, and each by itself."""
     cells = [

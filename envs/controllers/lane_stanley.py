@@ -16,6 +16,7 @@ TERMS = 11  # of the series: the next is below the rounding of the first
 
 def arctangent(x: Array) -> Array:
     """Return the arctangent, elementwise, with the same bits on every machine: 8 times that of an angle of pi / 16 at most."""
+    x = num.clip(x, -1e150, 1e150)  # its square is finite
     for _ in range(3):
         x = x / (1.0 + np.sqrt(1.0 + x * x))
     square, out = x * x, np.full_like(x, 1.0 / (2 * TERMS - 1))
@@ -43,8 +44,8 @@ class LaneStanley:
 
     gain: PositiveGain = param(1.0, "gain k of the offset at the front axle [1/s]")
     damping: NonNegative = param(0.0, "gain d of the yaw rate against the road [s]")
-    front: Positive = param(1.1, "distance l_f from the centre of gravity to the front axle [m]")
-    speed: PositiveSpeed = param(20.0, "speed v that it reckons with [m/s]")
+    front: Positive = param(1.1, "distance l_f from the centre of gravity to the front axle, as the plant's [m]")
+    speed: PositiveSpeed = param(20.0, "speed v that it reckons with, as the plant's [m/s]")
     limit: Positive = param(0.03, "largest steering angle [rad]")
     margin: Gap = param(1.75, "distance to the nearer line that it steers for: half of the lane [m]")
 

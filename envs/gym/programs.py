@@ -164,7 +164,7 @@ def programs_of(seat: Seat, device: str = "cpu") -> SeatPrograms | Untraced:
     shown = _shown_once(seat)
     return _made.proved(
         (shown, device),
-        lambda: _shown(shown, _example(shown)),
+        lambda: (begun := _example(shown), _shown(shown, begun)),
         lambda: SeatPrograms(seat, shown, device),
         lambda found, values: found.of(seat, values),
         difference,

@@ -5,8 +5,9 @@ and the known input u. The bounds depend on the sign of u where the clean runs g
 
     g = a' [y, m, y-, m-, u]        s = max |g - middle| / half width, over the invariants whose signals all arrived
 
-A step with s above the margin is a violation, and its readings are refused. One violation may be noise. The alarm goes on once `count` of
-the last `window` steps are violations. The score is the `count`-th largest s of these steps, so that the alarm is: score > margin.
+A step with s above the margin is a violation. Its readings are refused, and those of steps with an alarm. One violation may be noise. The
+alarm goes on once `count` of the last `window` steps are violations.
+The score is the `count`-th largest s of these steps, so that the alarm is: score > margin.
 
 `tailgate learn-envelope` makes the file (tailgate.studies.envelope).
 """
@@ -16,7 +17,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass
-from functools import cached_property
+from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
@@ -54,7 +55,7 @@ class Invariant(BaseModel):
     weights: Annotated[dict[str, Finite], Field(min_length=1, max_length=1000)]  # by signal, see `names_of`
     size: NonNegative  # the largest |weight x signal| of the clean runs
     bounds: Annotated[dict[Sign, Pair], Field(min_length=1)]
-    rates: dict[Sign, Probability]  # upper limit of the rate at which other clean steps leave the bounds
+    rates: dict[Sign, Probability]  # limit of the rate at which other clean steps leave the bounds, as if steps were independent
 
 
 class Sheet(BaseModel):
@@ -111,6 +112,12 @@ def load_envelope(path: Path) -> Sheet:
         if crossed := [sign for sign, (low, high) in one.bounds.items() if low > high]:
             raise InputError(f"{where}: invariants.{i}.bounds.{crossed[0]}", one.bounds[crossed[0]], "two numbers, the smaller first")
     return sheet
+
+
+@lru_cache(maxsize=32)
+def _loaded(path: Path, changed: int, size: int) -> Sheet:
+    """Return an envelope, read once for each state of its file; outside of the defence, whose attributes are a key of compiled code."""
+    return load_envelope(path)
 
 
 class EnvelopePlan(NamedTuple):
@@ -188,10 +195,15 @@ class Envelope(Composed):
             raise InputError("defence envelope.count", self.count, f"at most the window, {self.window}")
         _ = self.parts(), self.sheet  # a wrong name or a damaged file shall fail here
 
-    @cached_property
+    @property
     def sheet(self) -> Sheet:
         """The learned invariants."""
-        return load_envelope(envelope_path(self.path))
+        path = envelope_path(self.path)
+        try:
+            held = path.stat()
+        except OSError:
+            return load_envelope(path)  # which says what is wrong
+        return _loaded(path, held.st_mtime_ns, held.st_size)
 
     @property
     def sources(self) -> list[Path]:

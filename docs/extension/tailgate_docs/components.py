@@ -123,7 +123,7 @@ def _usage(entry: Entry, scenarios: list[str]) -> list[str]:
     if entry.family == "learner":
         return ["```console", f"python train.py learner={name} name=by-{name}", "```", ""]
     if entry.family == "reward":
-        return ["```python", "import gymnasium", "", f'env = gymnasium.make("tailgate:tailgate/CarFollowing-v0", reward="{name}")', "```", ""]
+        return ["```python", "import gymnasium", "", f'env = gymnasium.make("tailgate:tailgate/CarFollowing-v1", reward="{name}")', "```", ""]
     if at:
         return ["```python", "from tailgate.core.scenario import load_scenario", "", f'scenario = load_scenario("{at}")', "```", ""]
     return ["A scenario's file names it:", "", "```yaml", f"{entry.family}: {{name: {name}}}", "```", ""]

@@ -141,7 +141,7 @@ def from_log(folder: Path, scenarios: Sequence[str] | None, settings: Settings, 
     for split in SPLITS:
         parts = []
         for file in (file for file in files if file.split == split):
-            parts.append(_read_file(folder, file, signals[0]))
+            parts.append(_read_file(folder, file, signals[0], held.defences[0]))
             digests[file.path] = file.sha256
             if progress is not None:
                 progress("reading", len(digests), len(files))
@@ -149,12 +149,15 @@ def from_log(folder: Path, scenarios: Sequence[str] | None, settings: Settings, 
             raise InputError("log", str(folder), f"a log with files of the split {split}")
         splits.append(joined(parts))
         counts[split] = {"purpose": SPLITS[split], "steps": [len(part.columns) for part in parts]}
-    made = {"from": {name: held.scenarios[name].config_hash for name in names}, "driven_by": held.defences, **counts}
+    made = {"from": {name: held.scenarios[name].config_hash for name in names}, "driven_by": held.defences[:1], **counts}
     return sheet_of(signals[0], splits[0], splits[1], settings, made | {"log": digests}, progress)
 
 
-def _read_file(folder: Path, file: _File, signals: Signals) -> Samples:
-    """Return the clean steps of a file of a log. Raise InputError where it is not the file that schema.json describes."""
+def _read_file(folder: Path, file: _File, signals: Signals, driver: str) -> Samples:
+    """Return the clean steps of a file of a log, under one defence: others drive on the same roads, and are no further evidence.
+
+    Raise InputError where it is not the file that schema.json describes.
+    """
     pa, pq = pyarrow()
     path, digest = folder / file.path, hashlib.sha256()
     columns = [
@@ -168,7 +171,7 @@ def _read_file(folder: Path, file: _File, signals: Signals) -> Samples:
                 digest.update(block)
         if digest.hexdigest() != file.sha256:
             raise InputError("log", str(path), "the file whose SHA-256 schema.json names: it is damaged or another one")
-        table = pq.read_table(path, columns=columns, filters=[("attack", "==", "none")])
+        table = pq.read_table(path, columns=columns, filters=[("attack", "==", "none"), ("defence", "==", driver)])
         held = {name: table[name].to_numpy() for name in columns}
         numbers = [np.asarray(held[name], np.float64) for name in columns[5:]]
     except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
@@ -180,6 +183,10 @@ def _read_file(folder: Path, file: _File, signals: Signals) -> Samples:
     z, arrived = np.concatenate([y, rest[:, :p]], axis=1), np.concatenate([valid, np.ones((len(y), p), bool)], axis=1)
     if not np.isfinite(z[arrived]).all() or not np.isfinite(rest).all():
         raise InputError("log", str(path), "finite readings, messages and known inputs")
-    order = np.lexsort((held["k"], held["agent"], held["episode"], held["defence"].astype(str)))
-    begins = held["k"][order] == 1
+    order = np.lexsort((held["k"], held["agent"], held["episode"]))
+    k, run = held["k"][order], np.stack([held["agent"][order], held["episode"][order]])
+    same = np.concatenate([[False], (run[:, 1:] == run[:, :-1]).all(axis=0)])
+    fresh = np.concatenate([[True], np.diff(k) != 0]) | ~same  # clean episodes are the same at every dose
+    order, k, same = order[fresh], k[fresh], same[fresh]
+    begins = ~same | (np.diff(k, prepend=0) != 1)
     return sampled(z[order], arrived[order], rest[order][:, p:], begins)
