@@ -277,12 +277,12 @@ def test_what_is_no_envelope_is_refused(content, tmp_path):
 
 
 def test_a_log_and_its_scenario_teach_the_same(tmp_path):
-    """Files and play have the same steps: the same invariants to the last bit, and damage is found."""
+    """Files and play have the same steps, at however many doses: the same invariants to the last bit, and damage is found."""
     pytest.importorskip("pyarrow")
     from tailgate.studies.log import write_log
 
     folder = tmp_path / "log"
-    write_log("car-following-v0", folder, episodes=8, dev_episodes=8, scenarios=["thesis-ch4-v0"], doses=[10], attacks=["fdi:start_step=60,value=3"])
+    write_log("car-following-v0", folder, episodes=8, dev_episodes=8, scenarios=["thesis-ch4-v0"], doses=[10, 20], attacks=["fdi:start_step=60,value=3"])
     assert from_log(folder, None, LOOSE).invariants == from_scenarios(["thesis-ch4-v0"], 8, 8, LOOSE).invariants
     with pytest.raises(InputError, match="one of the log: thesis-ch4-v0"):
         from_log(folder, ["braking-v0"], LOOSE)
