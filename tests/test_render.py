@@ -252,7 +252,7 @@ def test_gymnasium_accepts_it(monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        env = gymnasium.make("tailgate:tailgate/CarFollowing-v0", render_mode="rgb_array", viewer="plain")
+        env = gymnasium.make("tailgate:tailgate/CarFollowing-v1", render_mode="rgb_array", viewer="plain")
         check_env(env.unwrapped)
         env.reset(seed=0)
         env.step(env.action_space.sample())
