@@ -62,6 +62,22 @@ def steady_bend(model: Model) -> tuple[float, float]:
     return float((right[0] * d - b * right[1]) / whole), float((a * right[1] - right[0] * c) / whole)
 
 
+class LaneController:
+    """What controllers of a lane share: they remember nothing, and their gap is the distance to a line."""
+
+    margin: float  # half of the lane [m]
+
+    def start(self, plan: object, batch: int) -> None:
+        return None
+
+    def held(self, plan: object, state: None, batch: int) -> Array:
+        return np.zeros((batch, 1, 0))
+
+    def desired_gap(self, speed: Array) -> Array:
+        """Return the distance to the nearer line from the middle of the lane [m]."""
+        return np.full_like(speed, self.margin)
+
+
 class LanePlan(NamedTuple):
     K: Array  # (4,)
     heading: float  # e_psi of the steady bend for each curvature [rad m]
@@ -70,7 +86,7 @@ class LanePlan(NamedTuple):
 
 @register("controller", "lane_lqr", reference="Rajamani, Vehicle Dynamics and Control, 2nd edition, 2012, sections 3.1 to 3.3")
 @dataclass(frozen=True)
-class LaneLqr:
+class LaneLqr(LaneController):
     """Steers by delta = delta_s kappa - K (x^ - x_s kappa), with the steady bend (x_s, delta_s) and the gain K of a regulator.
 
     The curvature kappa is the one that the map's message says. The speed is not this controller's: a mode that a defence asks for changes
@@ -86,18 +102,8 @@ class LaneLqr:
         require_lane("lane_lqr", model, self.margin)
         return LanePlan(regulator(model.A, model.B[:, 0], np.diag(self.weights), self.effort), *steady_bend(model))
 
-    def start(self, plan: LanePlan, batch: int) -> None:
-        return None
-
-    def held(self, plan: LanePlan, state: None, batch: int) -> Array:
-        return np.zeros((batch, 1, 0))
-
     def step(self, plan: LanePlan, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
         """Return the steering angle (B, 1, 1) [rad] for estimate.x (B, 1, 4) and the curvature v2v (B, 1, 1) [1/m]."""
         x, bend = estimate.x, v2v[..., 0]
         off = plan.K[0] * x[..., 0] + plan.K[1] * x[..., 1] + plan.K[2] * (x[..., 2] - plan.heading * bend) + plan.K[3] * x[..., 3]
         return None, num.clip(plan.steering * bend - off, -self.limit, self.limit)[..., None]
-
-    def desired_gap(self, speed: Array) -> Array:
-        """Return the distance to the nearer line from the middle of the lane [m]."""
-        return np.full_like(speed, self.margin)

@@ -9,7 +9,7 @@ from tailgate import num
 from tailgate.core import Array, Estimate, Model, NonNegative, Positive, param
 from tailgate.core.quantities import Gap, PositiveGain, PositiveSpeed
 from tailgate.core.registry import register
-from tailgate.envs.controllers.lane_lqr import require_lane, steady_bend
+from tailgate.envs.controllers.lane_lqr import LaneController, require_lane, steady_bend
 
 TERMS = 11  # of the series: the next is below the rounding of the first
 
@@ -35,7 +35,7 @@ class StanleyPlan(NamedTuple):
     reference="G. M. Hoffmann, C. J. Tomlin, M. Montemerlo, S. Thrun, Autonomous Automobile Trajectory Tracking for Off-Road Driving, 2007",
 )  # fmt: skip
 @dataclass(frozen=True)
-class LaneStanley:
+class LaneStanley(LaneController):
     """Steers by delta = delta_s kappa - psi - arctan(k e / v) - d e_psi', with psi = e_psi - psi_s kappa and e = e_y + l_f psi.
 
     psi_s and delta_s are those of the steady bend, without which a car cuts corners. The curvature kappa is the one that the map's
@@ -53,19 +53,9 @@ class LaneStanley:
         require_lane("lane_stanley", model, self.margin)
         return StanleyPlan(*steady_bend(model))
 
-    def start(self, plan: StanleyPlan, batch: int) -> None:
-        return None
-
-    def held(self, plan: StanleyPlan, state: None, batch: int) -> Array:
-        return np.zeros((batch, 1, 0))
-
     def step(self, plan: StanleyPlan, state: None, estimate: Estimate, v2v: Array, odometry: Array) -> tuple[None, Array]:
         """Return the steering angle (B, 1, 1) [rad] for estimate.x (B, 1, 4) and the curvature v2v (B, 1, 1) [1/m]."""
         x, bend = estimate.x, v2v[..., 0]
         turned = x[..., 2] - plan.heading * bend
         off = turned + arctangent(self.gain * (x[..., 0] + self.front * turned) / self.speed) + self.damping * x[..., 3]
         return None, num.clip(plan.steering * bend - off, -self.limit, self.limit)[..., None]
-
-    def desired_gap(self, speed: Array) -> Array:
-        """Return the distance to the nearer line from the middle of the lane [m]."""
-        return np.full_like(speed, self.margin)

@@ -184,7 +184,7 @@ class Envelope(Composed):
     path: Path = param(Path("car-following"), "JSON file of `tailgate learn-envelope`, or the name of one in the package")
     window: PositiveCount = param(5, "steps n that the alarm looks back on [steps]")
     count: PositiveCount = param(3, "violations m of these n that make an alarm: fewer are noise [steps]")
-    margin: Positive = param(1.0, "a violation is so many half widths from the middle of the learned bounds [-]")
+    margin: Positive = param(1.0, "distance of a violation from the middle of the learned bounds, in half widths [-]")
     filter: object = param("kf", "filter: a name, or a mapping with name and parameters")
     mitigation: object = param("gate_out", "mitigation: a name, or a mapping with name and parameters")
 

@@ -1,1 +1,1 @@
-"""What `make docs` makes from code, files and boards: the pages, and the Sphinx extension (site.py)."""
+"""The pages that `make docs` makes from code, files and boards, and the Sphinx extension (site.py)."""

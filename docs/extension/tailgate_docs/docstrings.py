@@ -46,7 +46,7 @@ def _listed(title: str, entries: list[tuple[str, str, list[str]]]) -> list[str]:
 
 
 def markdown(thing: object) -> str:
-    """Return the docstring of a class, function or module as Markdown; empty where it has none of its own."""
+    """Return the docstring of a class, function or module as Markdown; empty where it has none."""
     text = inspect.getdoc(thing) or ""
     if not text.strip():
         return ""

@@ -24,7 +24,7 @@ _FAMILIES = ("defence", "attack", "scenario", "suite", "metric", "plant", "senso
 
 
 class _Held:
-    """What one step of a build leaves to later ones; worker processes inherit it."""
+    """Results of a build's earlier steps, for later ones; worker processes inherit them."""
 
     links: Links
     names: dict[str, str]

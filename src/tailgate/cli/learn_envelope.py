@@ -66,6 +66,6 @@ def _learn(options: argparse.Namespace) -> int:
         rows.append((kind, str(len(some)), str(by_sign), f"{max(rate for one in some for rate in one.rates.values()):.2g}"))
     steps = {split: sum(sheet.made[split]["steps"]) for split in ("train", "dev")}
     caption = f"{steps['train']} training and {steps['dev']} held-out steps of {', '.join(sheet.made['from'])}"
-    table(("kind", "invariants", "with bounds for a sign of the input", "rate, at most"), rows, f"envelope {out.name}", caption)
+    table(("kind", "invariants", "with bounds for a sign of the input", "limit of the rate"), rows, f"envelope {out.name}", caption)
     say(f"{out}: SHA-256 {sheet.sha256}", soft_wrap=True)
     return 0
