@@ -43,12 +43,12 @@ Paths = list[tuple[Any, ...]]
 
 
 def mutated(valid: bytes, form: str, rng: random.Random) -> bytes:
-    """One input made of a valid file of a format: yaml, json, jsonl, xz, csv, tensors, parquet or text."""
+    """One input made of a valid file of a format: yaml, json, jsonl, xz, csv, tensors, parquet, npy or text."""
     if form == "xz":
         return _packed(valid, rng)
     if form == "tensors" and rng.random() < 0.7:
         return _tensors(valid, rng)
-    if form in ("tensors", "parquet"):
+    if form in ("tensors", "parquet", "npy"):
         return _bytes(valid, rng)
     draw = rng.random()
     if form in ("json", "yaml", "jsonl") and draw < 0.5:

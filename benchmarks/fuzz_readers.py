@@ -15,6 +15,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from fuzz_roads import ROADS, beside_recorded, read_recorded, recorded
+from fuzz_texts import TEXTS
+
 ROOT = Path(__file__).parents[1]
 CONFIGS, RESULTS = ROOT / "configs", ROOT / "results"
 BOARD = RESULTS / "quick-v0"
@@ -321,81 +324,6 @@ def _search(folder: Path) -> Any:
 # -- texts of the command line
 
 
-def _said(read: Callable[[str], Any]) -> Callable[[Path], Any]:
-    return lambda folder: read((folder / "text").read_bytes().decode("utf-8", "surrogateescape"))
-
-
-def _override(text: str) -> Any:
-    from tailgate.training.train import load_config
-
-    return load_config(None, text.split("\n"))
-
-
-def _component(text: str) -> Any:
-    from tailgate.core.registry import Spec
-
-    family: Any = "attack" if text.startswith(("a ", "b")) else "defence"
-    spec = Spec(family, text)
-    spec.refuse_imports("text")
-    return None if spec.sandboxed else spec.make()
-
-
-def _formula(text: str) -> Any:
-    from tailgate.trust.formula import parse
-
-    return parse(text)
-
-
-def _arguments(text: str) -> Any:
-    import contextlib
-    import io
-
-    from tailgate.base.errors import InputError
-    from tailgate.cli.command_line import _parser
-
-    said = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
-            return _parser().parse_args(text.split("\n"))
-    except SystemExit as error:
-        if error.code == 2 and said.getvalue().count("\n") == 1:
-            raise InputError("arguments", text, "arguments") from None
-        if error.code != 0:
-            raise ValueError(f"exit code {error.code}: {said.getvalue()[:200]}") from None
-        return None
-
-
-OVERRIDES = (
-    b"defence=kf\nthreat.budget=12\nsteps=2000", b"learner=cem\ncem.population=64\nname=a", b"environment.frames=4\nrivals=[none, jam]",
-    b"defence=chi2_kf:eta=15\nwhite_box=[]\nteacher=best", b"gamma=0.99\ntensorboard=false\nout=runs\noutcome=crashed",
-)  # fmt: skip
-COMPONENTS = (
-    b"chi2_kf:eta=15", b"composed:filter=rkf,detector=cusum,mitigation=reacquire", b"safe_state", b"burst_loss:probability=0.5", b"bias:value=[1, 2]",
-    b"composed:filter=kf,detector=chi2,detector.eta=12", b"steered:defence=kf", b"policy:path=x.json", b"brake_kf",
-)  # fmt: skip
-FORMULAS = (b"G[0,60] gap > 2", b"G (attack -> F[0,0.6] applied <= -2)", b"(gap > 2 and not alarm) U[1,2.5] 2*speed - gap >= 0.5", b"F[0,end] true or false")
-ARGUMENTS = (
-    b"evaluate\n--suite\nquick-v0\n--defence\nkf\n--workers\n2\n--out\nrows.jsonl", b"leaderboard\nrun\nquick-v0\n--out\nboards", b"train\n--config\nquickstart\nsteps=5",
-    b"trust\n--suite\nquick-v0\n--runs\n400\n--alpha\n0.05", b"calibrate\n--defence\ncusum_kf\n--hours\n1", b"replay\nrows.jsonl\n--out\nreplay", b"list",
-    b"dose\njam\n--defence\nkf\n--scenario\nbraking-v0\n--doses\n1,2,3\n--limit\n0.1",
-)  # fmt: skip
-
-
-def _recorded(kind: str) -> list[bytes]:
-    """A car behind another for 30 samples."""
-    t = [round(0.1 * k, 1) for k in range(90)]
-    if kind == "openacc":
-        return [("Time,Speed1,Speed2,IVS1\n" + "\n".join(f"{x},20.0,20.0,{25 + 0.01 * i}" for i, x in enumerate(t))).encode()]
-    if kind == "ultra-av":
-        return [("Trajectory_ID,Time_Index,Speed_LV,Speed_FAV,Space_Gap\n" + "\n".join(f"1,{x},20.0,20.0,25.5" for x in t)).encode()]
-    if kind == "sumo-fcd":
-        place = '<vehicle id="{}" lane="a_0" pos="{}" speed="20.0"/>'
-        steps = (f'<timestep time="{x}">{place.format("b", 40 + 20 * x)}{place.format("a", 20 * x)}</timestep>' for x in t)
-        return [f'<?xml version="1.0"?><fcd-export>{"".join(steps)}</fcd-export>'.encode()]
-    lines = [{"type": kind, "rcvTime": x, "sender": 7, "pos": [20.0 * x + at, 0.0, 0.0], "spd": [20.0, 0.0, 0.0]} for x in t for kind, at in ((2, 0.0), (3, 30.0))]
-    return ["\n".join(json.dumps(line) for line in lines).encode()]
-
-
 def readers() -> dict[str, Reader]:
     """All of them by name."""
     cem, ppo = _cem_checkpoint(), _checkpoint("ppo", envs=4, rollout=4, batch_size=16)
@@ -417,8 +345,8 @@ def readers() -> dict[str, Reader]:
                command=("tune", "--trials", "1", "--space", "{}", "out=runs")),
         Reader("speed profile", "csv", "profile.csv", lambda: [PROFILE], _profile),
         *(
-            Reader(f"recording of {kind}", form, name, partial(_recorded, kind), _call("roads.readers", "read", name, kind, text=True))
-            for kind, form, name in (("openacc", "csv", "a.csv"), ("ultra-av", "csv", "a.csv"), ("sumo-fcd", "text", "a.xml"), ("veremi", "jsonl", "a.jsonl"))
+            Reader(f"recording of {kind}", form, name, partial(recorded, kind), partial(read_recorded, kind, name), partial(beside_recorded, kind))
+            for kind, form, name in ROADS
         ),
         Reader("rows", "jsonl", "rows.jsonl", _rows, _read_rows("rows.jsonl"), command=("leaderboard", "build", "--rows", "{}", "--out", "page")),
         Reader("compressed rows", "xz", "rows.jsonl.xz", _rows, _read_rows("rows.jsonl.xz"),
@@ -454,9 +382,6 @@ def readers() -> dict[str, Reader]:
         Reader("log's schema", "json", "schema.json", lambda: [b'{"format": "tailgate-log-1", "identity": "x", "files": [{"path": "README.md", "bytes": 0}]}'], _log),
         Reader("log's part", "parquet", "part.parquet", _parquet, _part),
         Reader("search's journal", "jsonl", "journal.jsonl", _journal, _search, slow=2.0),
-        Reader("overrides", "text", "text", lambda: OVERRIDES, _said(_override), slow=2.0),
-        Reader("component texts", "text", "text", lambda: COMPONENTS, _said(_component)),
-        Reader("formulas", "text", "text", lambda: FORMULAS, _said(_formula)),
-        Reader("arguments", "text", "text", lambda: ARGUMENTS, _said(_arguments), slow=5.0),
+        *(Reader(name, "text", "text", partial(list, texts), read, slow=slow) for name, texts, read, slow in TEXTS),
     ]  # fmt: skip
     return {reader.name: reader for reader in made}

@@ -9,20 +9,17 @@ import pytest
 from tailgate.agents.policy.network_policy import load_policy
 from tailgate.base.errors import InputError
 from tailgate.core import Kind
-from tailgate.core.draws import Role, keys
+from tailgate.core.draws import keys
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
 from tailgate.core.schema import as_data
 from tailgate.envs.gym import observations as observation
 from tailgate.envs.gym.actions import ActionCodec, ActionSpec
-from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.envs.gym.gymnasium_env import AdversaryVectorEnv
 from tailgate.envs.gym.observations import LIMIT, ObservationCodec
-from tailgate.envs.gym.rewards import NEAR, Reward
+from tailgate.envs.gym.rewards import Reward
 from tailgate.envs.plants.platoon import Platoon, PlatoonSensors
 from tailgate.envs.plants.sensor_network import LinearSensors, NoControl, SensorNetwork
-from tailgate.play.metrics import METRICS
-from tailgate.play.trace import rollout
 
 ROOT = Path(__file__).parents[1]
 DKF = Spec("defence", "dkf")
@@ -354,40 +351,6 @@ def test_error_pays_the_largest_error_of_an_agent(kind):
     np.testing.assert_allclose(Reward(reward="final", error_scale=4.0)(model, frame, fall, last), final)
 
 
-@pytest.mark.thin(3)
-@pytest.mark.parametrize(("scenario", "defence"), [("network-restless-v0", "dkf"), ("platoon-gusty-v0", "dkf"), ("stop-and-go-v0", "kf")])
-def test_the_rises_of_the_peak_add_up_to_the_largest_error(scenario, defence):
-    """What `peak` pays for in an episode is `max_error` over error_scale, however many steps a decision lasts."""
-    scale = 7.0
-    seat = Seat.make(scenario, defence, {"budget": 5}, reward="peak", error_scale=scale, gap_shaping=0.0, error_shaping=0.0, interval=3)
-    loop, attack, rows = seat.loop, Spec("attack", "fdi:start_step=60,value=-3").make(), keys("report", range(6))
-    plan = attack.prepare(loop.brief)
-    state, memory = loop.start(rows), attack.start(plan, 6, rows.at(Role.ATTACK, np.zeros(6, np.int64)))
-    tally, over, total = seat.begin(state), np.zeros(6, bool), np.zeros(6)
-
-    def chosen(view):
-        nonlocal memory
-        memory, command = attack.decide(plan, memory, view, rows.at(Role.ATTACK, view.k))
-        return command
-
-    for _ in range(seat.decisions):
-        state, tally, outcome, _ = seat.step(state, tally, chosen, over)
-        total += outcome.reward
-        over = over | outcome.terminated | outcome.truncated
-    wanted = METRICS["max_error"](rollout(loop, attack, rows))
-    assert wanted.min() > 1.0
-    np.testing.assert_allclose(total * scale, wanted, rtol=1e-12)
-
-
-def test_the_smallest_gap_of_any_car_counts():
-    """min_gap and the potentials look at the worst car; the leader, whom nothing is ahead of, is none."""
-    reward = Reward(gap_shaping=1.0, error_shaping=1.0)
-    gap = np.array([[np.inf, 50.0, 12.0, 80.0], [np.inf, 50.0, 40.0, 30.0]])
-    assert reward.least(gap).tolist() == [12.0, NEAR] and reward.least(gap, np.array([5.0, 5.0])).tolist() == [5.0, 5.0]
-    belief = np.array([[0.0, -3.0, 7.0, 0.0], [0.0, 0.0, 0.0, -9.0]])
-    np.testing.assert_allclose(reward.potential(gap, belief), [0.88 + 0.7, 0.7])
-
-
 def test_without_a_road_potentials_are_zero_and_nothing_collides():
     """Infinite gaps give potential 0; a reward for collisions is refused."""
     model = _network(5).brief().model
@@ -396,12 +359,3 @@ def test_without_a_road_potentials_are_zero_and_nothing_collides():
     for name in ("min_gap", "collision"):
         with pytest.raises(InputError, match=f"reward.*'{name}'.*error, peak, stealth or final"):
             AdversaryVectorEnv(2, scenario="thesis-ch5-v0", defence="dkf", reward=name)
-
-
-def test_belief_is_positive_where_a_car_thinks_it_has_more_room():
-    """Added distance makes a follower believe in a larger gap: the shaping potential rises."""
-    env = AdversaryVectorEnv(2, scenario="platoon-braking-v0", defence="dkf", value=20.0, gap_shaping=0.0, gamma=1.0, reward="collision",
-                             threat={"targets": ["distance"], "kinds": ["fdi"], "onset": 1})  # fmt: skip
-    env.reset(seed=0)
-    paid = sum(env.step(np.array([1, 2]))[1] for _ in range(20))
-    assert paid[0] > 0.3 and paid[1] <= 0.05

@@ -14,7 +14,6 @@ from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Kind
 from tailgate.core.draws import Role, keys
 from tailgate.core.scenario import load_scenario
-from tailgate.envs.gym.gymnasium_env import AdversaryVectorEnv
 from tailgate.play.trace import rollout
 
 K = 60
@@ -329,66 +328,6 @@ def test_an_inverted_jammer_is_refused():
     """low above high is an input error that names the field."""
     with pytest.raises(InputError, match=r"dos_jam\.low: got 2\.0; expected at most high \(1\.0\)"):
         tailgate.make_attack("dos_jam", low=2.0, high=1.0)
-
-
-def _episode(interval=1, **options):
-    """Two environments with the same episodes, with shaping and without it: first themselves, then a pair of outputs per step."""
-    envs = []
-    for extra in ({}, {"gap_shaping": 0.0, "error_shaping": 0.0}):
-        options |= {"scenario": "gusty-stop-and-go-v0", "value": -20.0, "interval": interval}
-        env = AdversaryVectorEnv(8, engine="plain", autoreset="disabled", **options, **extra)
-        env.seat = env.episodes.seat = dataclasses.replace(env.seat, loop=dataclasses.replace(env.seat.loop, horizon=240))
-        env.reset(seed=0)
-        envs.append(env)
-    yield envs, None
-    rng = np.random.default_rng(0)
-    while True:
-        actions = rng.integers(0, envs[0].seat.action.size, 8)
-        pair = [env.step(actions) for env in envs]
-        yield envs, pair
-        if (pair[0][2] | pair[0][3]).any():
-            return
-
-
-@pytest.mark.parametrize("interval", [1, 5])
-@pytest.mark.parametrize("reward", ["collision", "min_gap", "error", "stealth"])
-@pytest.mark.thin(2)
-def test_shaping_telescopes(reward, interval):
-    """The discounted sum of what shaping adds is gamma^T Phi(end) - Phi(start), Phi(end) = 0 at a collision: no policy gains."""
-    total, discount = np.zeros(8), 1.0
-    episode = _episode(reward=reward, gamma=0.97, interval=interval)
-    (shaped, _), _ = next(episode)
-    start = shaped.tally.potential.copy()
-    assert start.min() > 0.05
-    for _, (one, two) in episode:
-        total += discount * (one[1] - two[1])
-        discount *= 0.97
-        terminated = one[2]
-    end = np.where(terminated, 0.0, shaped.tally.potential)
-    np.testing.assert_allclose(total, discount * end - start, atol=1e-12)
-
-
-@pytest.mark.parametrize("interval", [1, 5])
-@pytest.mark.thin(2)
-def test_raw_rewards(interval):
-    """collision pays 1 at a crash; min_gap also the fall of the smallest gap below 20 m, over 20 m; error and stealth per second."""
-    paid = {name: np.zeros(8) for name in ("collision", "min_gap", "error", "stealth")}
-    for name in paid:
-        least, alarms, crashed = np.full(8, 20.0), np.zeros(8), np.zeros(8, bool)
-        episode = _episode(reward=name, interval=interval)
-        (_, bare), _ = next(episode)
-        for _, (_, two) in episode:
-            paid[name] += two[1]
-            crashed |= two[2]
-            least = np.minimum(least, bare.frame.scene.gap[:, 0])
-            alarms += 0.1 * bare.frame.estimate.alarm[:, 0]
-        if name == "collision":
-            np.testing.assert_array_equal(paid[name], crashed.astype(float))
-        if name == "min_gap" and interval == 1:
-            np.testing.assert_allclose(paid[name], crashed + 1.0 - np.maximum(least, 0.0) / 20.0, atol=1e-12)
-    assert (paid["error"] > 0).all()
-    if interval == 1:
-        np.testing.assert_allclose(paid["error"] - paid["stealth"], alarms, atol=1e-9)
 
 
 def test_rollout_stops_when_all_have_crashed(short, loop_of):
