@@ -17,11 +17,11 @@ from tailgate.engine.functions import gathered
 from tailgate.engine.loops import until
 from tailgate.engine.operations import BOOL, FLOAT, Array
 
-SMALL = 500  # products of numbers up to which numpy is faster than a call of machine code
+SMALL = 4000  # products of numbers up to which numpy is faster than a call of machine code
 LOOPED = 64  # numbers of a dense matrix from which multiplication is a loop, because straight code takes long to compile
 SPARSE = 100  # numbers of a sparse matrix from which multiplication is a loop
 STRAIGHT = 600  # products of numbers in straight code
-AT_ONCE = 20_000  # products of numbers that numpy holds in memory before it adds them
+AT_ONCE = 600  # products of numbers up to which numpy is fastest if it holds all of them before it adds them
 
 
 def _large(size: int, *arrays: Array) -> bool:
@@ -118,7 +118,7 @@ def product(x: Array, y: Array) -> Array:
     return _summed(x, y)
 
 
-@shaped(lambda s: s.ndim > 2 < s.shape[-1] and s.size > SMALL)
+@shaped(lambda s: s.ndim > 2 < s.shape[-1] and s.size * s.shape[-1] > SMALL)
 def inverse(s: Array) -> Array:
     """Invert symmetric positive definite (..., q, q): in closed form for q <= 2, else by Gauss-Jordan without pivots."""
     q = s.shape[-1]
