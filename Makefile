@@ -35,18 +35,18 @@ crash: $(VENV)/.ready  ## end the long commands at random moments, and see that 
 fuzz: $(VENV)/.ready  ## 10 000 malformed inputs for each reader; `make fuzz FUZZ="--reader rows --inputs 500"` for less
 	$(BIN)/python benchmarks/fuzz.py $(FUZZ)
 
-# torch comes first and pinned: left to the others it would be the largest build that exists
+# torch comes first and pinned: left to the others it would be the largest build that exists. --no-compile: Python compiles what is imported
 $(VENV)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.12")'
 	@echo 'Installing into $(VENV): one to five minutes, torch first'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[all,dev]'
+	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt torch
+	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[all,dev]'
 	touch $@
 
 $(VENV)/.docs: $(VENV)/.ready
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[docs]'
 	touch $@
 
 clean:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from tailgate.base.errors import InputError
 from tailgate.thesis import Claim, Report, reproduce, write
 from tailgate.thesis.ch4_cases import READINGS
 from tailgate.thesis.claims import Spread, Table, verdict
-from tailgate.thesis.run import flat, markdown
+from tailgate.thesis.run import flat, markdown, read
 
 FIELDS = {"id", "claim", "thesis", "measured", "holds", "why"}
 
@@ -170,9 +171,12 @@ def test_bad_input(arguments, named, capsys):
 @pytest.mark.thin(2)
 @pytest.mark.page
 @pytest.mark.parametrize("width", [360, 1280])
-def test_the_page_in_a_browser(chapter_4, load, asked, width):
-    """No message, no request but for the file, every figure decoded, and nothing wider than the window but the tables, which scroll."""
-    page = chapter_4[2] / "index.html"
+def test_the_page_in_a_browser(tmp_path, load, asked, width):
+    """The published chapter: no message, no request but for the file, every figure decoded, and nothing wider than the window but the tables, which scroll."""
+    found = read(Path(__file__).parents[1] / "results/reproduction/ch4")
+    assert found is not None
+    write(found[0], tmp_path)
+    page = tmp_path / "index.html"
     browser = load(page, width)
     assert browser.get_log("browser") == []
     assert asked() == {page.as_uri()}
