@@ -150,7 +150,7 @@ class Compiler(types.SimpleNamespace):
     """`cuda.bindings.nvrtc`; the code is this processor's."""
 
     def __init__(self, card: HostCard, version: tuple[int, int] = (13, 0)) -> None:
-        super().__init__(card=card, version=version, texts={}, options=[], compiled=0)
+        super().__init__(card=card, version=version, texts={}, options=[], compiled=0, held=0)
 
     def nvrtcVersion(self) -> tuple[int, int, int]:
         return (0, *self.version)
@@ -159,6 +159,7 @@ class Compiler(types.SimpleNamespace):
         return 0, [75, 80, 90, 100]
 
     def nvrtcCreateProgram(self, text: bytes, name: bytes, headers: int, sources: list[bytes], names: list[bytes]) -> tuple[int, Any]:
+        self.held += 1
         return 0, {"text": text.decode(), "code": b""}
 
     def nvrtcCompileProgram(self, program: Any, count: int, options: list[bytes]) -> tuple[int]:
@@ -184,6 +185,7 @@ class Compiler(types.SimpleNamespace):
         return (0,)
 
     def nvrtcDestroyProgram(self, program: Any) -> tuple[int]:
+        self.held -= 1
         return (0,)
 
 

@@ -232,10 +232,13 @@ def test_the_bound_on_registers(host_card: HostCard, monkeypatch: pytest.MonkeyP
         SeatPrograms(seat, device="cuda")
 
 
-def test_an_error_of_the_compiler_has_its_log(nvidia: Any) -> None:
+def test_an_error_of_the_compiler_has_its_log_and_its_program_is_freed(nvidia: Any) -> None:
     nvidia()
     with pytest.raises(RuntimeError, match=r"compiler: .*line 1: bad"):
         cards.card().compiled("error")
+    from cuda.bindings import nvrtc
+
+    assert (nvrtc.compiled, nvrtc.held) == (1, 0)
 
 
 # -- what is refused

@@ -127,6 +127,16 @@ from tailgate"""
     assert done.stderr.splitlines() == ["tailgate: interrupted; nothing had started"] and done.returncode == 130
 
 
+def test_a_library_that_raises_its_own_interrupt_does_not_hide_the_signal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Ray catches what a handler raises, and raises a plain KeyboardInterrupt."""
+    monkeypatch.setattr(interrupts, "_kill_workers", lambda: None)
+    ending = interrupts.Ending(lambda: "the same command goes on")
+    with pytest.raises(interrupts.Terminated):
+        ending.handle(signal.SIGTERM, None)
+    assert ending.last_words(KeyboardInterrupt()) == 143
+    assert capsys.readouterr().err == "tailgate: terminated; the same command goes on\n"
+
+
 def test_elsewhere_handlers_are_put_back(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Called from somebody's program a command leaves its signals as they were, and in another thread they are not touched."""
     before = [signal.getsignal(number) for number in interrupts.WORDS], sys.unraisablehook

@@ -99,7 +99,8 @@ class Ending:
     def last_words(self, error: KeyboardInterrupt) -> int:
         """Print the last line of the command and return its exit code."""
         _kill_workers()
-        number = signal.SIGTERM if isinstance(error, Terminated) else signal.SIGINT
+        terminated = isinstance(error, Terminated) or self.number == signal.SIGTERM  # Ray raises a plain KeyboardInterrupt for every signal
+        number = signal.SIGTERM if terminated else signal.SIGINT
         print(f"tailgate: {WORDS[number]}; {self.kept()}", file=sys.stderr, flush=True)
         self.said = True
         return 128 + number

@@ -212,13 +212,15 @@ def _known() -> tuple[int, ...]:
 def compiled(text: str, options: Sequence[str]) -> bytes:
     """Return the machine code of CUDA C; no card is needed."""
     program = _compiler(nvrtc.nvrtcCreateProgram(text.encode(), b"step.cu", 0, [], []))
-    given = [option.encode() for option in options]
-    code = nvrtc.nvrtcCompileProgram(program, len(given), given)[0]
-    if int(code):
-        log = bytearray(_compiler(nvrtc.nvrtcGetProgramLogSize(program)))
-        nvrtc.nvrtcGetProgramLog(program, log)
-        raise RuntimeError(f"the card's compiler: {_name(code)}: {log.decode(errors='replace')[:1000]}")
-    held = bytearray(_compiler(nvrtc.nvrtcGetCUBINSize(program)))
-    _compiler(nvrtc.nvrtcGetCUBIN(program, held))
-    nvrtc.nvrtcDestroyProgram(program)
-    return bytes(held)
+    try:
+        given = [option.encode() for option in options]
+        code = nvrtc.nvrtcCompileProgram(program, len(given), given)[0]
+        if int(code):
+            log = bytearray(_compiler(nvrtc.nvrtcGetProgramLogSize(program)))
+            nvrtc.nvrtcGetProgramLog(program, log)
+            raise RuntimeError(f"the card's compiler: {_name(code)}: {log.decode(errors='replace')[:1000]}")
+        held = bytearray(_compiler(nvrtc.nvrtcGetCUBINSize(program)))
+        _compiler(nvrtc.nvrtcGetCUBIN(program, held))
+        return bytes(held)
+    finally:
+        nvrtc.nvrtcDestroyProgram(program)
