@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shlex
 from pathlib import Path
 
 import pytest
@@ -40,7 +41,8 @@ def test_the_command(small_ensemble, tmp_path, capsys, monkeypatch):
     attacks = (tmp_path / "attacks.txt").read_text().splitlines()
     own = {one["member"]: one for one in cell["members"]}
     assert list(own) == ["scripts", "programs", "transfer", "networks", "grey networks", "white box", "gradient"]
-    assert attacks == [one["attack"] for one in own.values() if one["attack"]] and cell["found"]["attack"] in attacks
+    harm = [next(one["damage"] for one in own.values() if one["attack"] == attack) for attack in attacks]
+    assert set(attacks) == {one["attack"] for one in own.values() if one["attack"]} and harm == sorted(harm, reverse=True) and cell["found"]["attack"] in attacks
     assert [one["knowledge"] for one in own.values()] == ["black"] * 4 + ["grey", "white", "white"]
     assert own["programs"]["attack"].startswith("program:path=") and own["networks"]["attack"].startswith("policy:path=")
     evaluate = ["evaluate", "--suite", "radar-v0", "--scenario", "radar-braking-v0", "--dose", "4", "--defence", "chi2_kf", "--seeds", "20"]
@@ -52,7 +54,12 @@ def test_the_command(small_ensemble, tmp_path, capsys, monkeypatch):
         assert one["attack"] is None or sum(row["crashed"] for row in rows if row["attack"] == one["attack"]) / 20 == one["damage"]
     monkeypatch.setattr(standard, "search", lambda *_: pytest.fail("searched again"))
     assert main([*WORDS, "--out", str(tmp_path)]) == 0
-    assert "best of the suite" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "best of the suite" in said
+    again = shlex.split(said.rpartition("play the most harmful one again: tailgate ")[2])
+    assert again[again.index("--attack") + 1] == attacks[0] and again[again.index("--scenario") + 1] == "radar-braking-v0"
+    assert main([*again[:-1], str(tmp_path / "most.jsonl"), "--seeds", "20"]) == 0
+    assert sum(json.loads(line)["crashed"] for line in (tmp_path / "most.jsonl").read_text().splitlines()) == 20 * harm[0]
     next(tmp_path.glob("attacks/*/policies/*-grey-*.safetensors")).with_suffix(".json").unlink()
     with pytest.raises(pytest.fail.Exception, match="searched again"):  # a file that is missing is made again
         main([*WORDS, "--out", str(tmp_path)])

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -77,6 +78,13 @@ def test_a_reward(tmp_path):
 def test_a_reward_takes_its_options_with_it():
     with pytest.raises(InputError, match=r"error_scale: got 3\.0; expected no such option: Scare"):
         AdversaryVectorEnv(1, reward=Scare(), error_scale=3.0)
+
+
+def test_a_reward_has_the_shaping_of_its_id():
+    """Ids of -v1 shape nothing, whatever the object's own default; its other fields stay."""
+    env = gymnasium.make("tailgate:tailgate/CarFollowing-v1", reward=Scare(comfort=0.25)).unwrapped
+    reward = env.batch.seat.reward
+    assert (type(reward), reward.comfort, reward.gap_shaping, reward.error_shaping) == (Scare, 0.25, 0.0, 0.0)
 
 
 def test_a_metric(monkeypatch):

@@ -30,7 +30,8 @@ FACES: dict[str, dict[str, Any]] = {  # defaults of each id
     "tailgate/LaneKeeping-v0": {"scenario": "lane-keeping-v0", "defence": "chi2_kf", "value": 0.5},
     "tailgate/Highway-v0": {"scenario": "highway-v0", "defence": "chi2_kf"},
 }
-_LEARN: dict[str, Any] = {"gap_shaping": 0.0, "error_shaping": 0.0}
+SHAPING = {"gap_shaping", "error_shaping"}
+_LEARN: dict[str, Any] = dict.fromkeys(sorted(SHAPING), 0.0)
 FACES |= {  # tasks that are worth learning: a budget, decisions that last, no shaping
     "tailgate/CarFollowing-v1": _LEARN | {
         "scenario": "gusty-stop-and-go-v0", "defence": "chi2_kf", "value": -3.0, "interval": 20,
@@ -87,13 +88,14 @@ class Outcome(NamedTuple):
 
 
 def _reward(options: dict[str, Any]) -> Reward:
-    """Return the reward from its options, or the object given in their place."""
+    """Return the reward from its options; or the object given in their place, with the shaping of the options: ids of `-v1` set it."""
     own = options.get("reward")
     if not isinstance(own, Reward):
         return build(Reward, options, "reward")
-    for key in options.keys() - {"reward"}:
+    for key in options.keys() - {"reward"} - SHAPING:
         raise InputError(key, options[key], f"no such option: {type(own).__name__}, the reward given as an object, holds it")
-    return own
+    shaping = {key: value for key, value in options.items() if key in SHAPING}
+    return dataclasses.replace(own, **shaping) if shaping else own
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -1,6 +1,7 @@
 """Progress of long work on standard error: a bar on a terminal, one line per tenth elsewhere."""
 
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -12,15 +13,23 @@ Update = Callable[[str, int, int, str], None]  # label, done, total, figures
 
 @contextmanager
 def progress(shown_on: Console) -> Iterator[Update]:
-    """Yield a function update(label, done, total, figures); each label has one bar."""
+    """Yield a function update(label, done, total, figures); each label has one bar.
+
+    Lines have the time since the label's first update, and from a minute on the time left at the pace since then.
+    """
     if not shown_on.is_terminal:
         shown: dict[str, int] = {}
+        begun: dict[str, tuple[float, int]] = {}
 
         def line(label: str, done: int, total: int, figures: str = "") -> None:
-            tenth = 10 * done // max(total, 1)
+            now, tenth = time.monotonic(), 10 * done // max(total, 1)
+            since, before = begun.setdefault(label, (now, done))
             if tenth > shown.get(label, 0):
                 shown[label] = tenth
-                shown_on.print(f"{label}: {10 * tenth} % {figures}".rstrip(), highlight=False, soft_wrap=True, markup=False)
+                took = now - since
+                left = took * (total - done) / (done - before) if done > before else 0.0
+                times = f" ({said(took)}{f', about {said(left)} left' if left >= 60.0 else ''})" if took >= 1.0 else ""
+                shown_on.print(f"{label}: {10 * tenth} % {figures}".rstrip() + times, highlight=False, soft_wrap=True, markup=False)
 
         yield line
         return
@@ -37,6 +46,14 @@ def progress(shown_on: Console) -> Iterator[Update]:
             bars.update(tasks[label], completed=done, total=total, figures=figures)  # type: ignore[arg-type]
 
         yield bar
+
+
+def said(seconds: float) -> str:
+    """Return a time in words: 40 s, 3 min 20 s, 2 h 5 min."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    return f"{whole // 60} min {whole % 60} s" if whole < 3600 else f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
 def cells(done: int, total: int) -> str:

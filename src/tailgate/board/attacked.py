@@ -31,11 +31,13 @@ class Attacked(NamedTuple):
 def attack(
     suite: Suite, defence: str, out: Path, *, seeds: int | None = None, episodes: int | None = None, beacon: str = "", workers: int = 1,
     changes: tuple[str, ...] = (), progress: Progress, counting: Callable[[Progress], Progress] = lambda told: told,
+    announce: Callable[[float], None] | None = None,
 ) -> Attacked:  # fmt: skip
     """Make a suite's attackers against a defence, and play them on it. Finished work is neither made nor played again.
 
     Policies go to out/policies, rows to out/DEFENCE*.jsonl, what the ensemble found to out/found. seeds, episodes: instead of the suite's;
-    beacon: the round; changes: key=value of the training; counting: of the cells that are played. Raises InputError for a suite without a
+    beacon: the round; changes: key=value of the training; counting: of the cells that are played; announce: called with the seconds that
+    searches will take, about. Raises InputError for a suite without a
     plan.
     """
     plan = plan_of(suite)
@@ -49,7 +51,7 @@ def attack(
     for config in configs:
         groups.setdefault((fitting(suite, config), ""), []).extend(map(str, policies_of(config)))
     if plan.ensemble:
-        found = search(suite, defence, out, beacon=beacon, workers=workers, progress=progress)
+        found = search(suite, defence, out, beacon=beacon, workers=workers, progress=progress, announce=announce)
         for scenario, texts in attacks_of(found).items():
             groups[(scenario,), "-found" if configs else ""] = [text for text in texts if text not in suite.attacks]
         groups = {key: texts for key, texts in groups.items() if texts}

@@ -19,6 +19,7 @@ SPECIAL = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
 }  # fmt: skip
+SIGNS = {"<=": r"$\leq$", ">=": r"$\geq$"}
 TITLE = "Tailgate: a benchmark in which an adversary learns when to attack the sensors of adaptive cruise control"  # as in CITATION.cff
 DRAWN = 8  # defences with a colour in the figure; the others are grey
 
@@ -61,8 +62,9 @@ def _csv(shown: list[tuple[str, ...]]) -> bytes:
 
 
 def escaped(text: str) -> str:
-    """Return text in which LaTeX reads every character as it is."""
-    return "".join(SPECIAL.get(character, character) for character in text)
+    """Return text in which LaTeX reads every character as it is, but for <= and >=, which become their signs."""
+    parts = re.split("([<>]=)", text)
+    return "".join(SIGNS[part] if part in SIGNS else "".join(SPECIAL.get(one, one) for one in part) for part in parts)
 
 
 def _latex(shown: list[tuple[str, ...]], caption: str) -> str:
@@ -71,7 +73,8 @@ def _latex(shown: list[tuple[str, ...]], caption: str) -> str:
     kept = [i for i in range(len(head)) if any(line[i] for line in body)]
     rows = [" & ".join(escaped(line[i]) for i in kept) + r" \\" for line in (head, *body)]
     return "\n".join([
-        r"\begin{table}", r"\centering", rf"\caption{{{escaped(caption)}}}", rf"\begin{{tabular}}{{{'l' * len(kept)}}}", r"\toprule",
+        r"\begin{table}", r"\centering", rf"\caption{{{escaped(caption)}}}", r"\label{tab:tailgate}",
+        rf"\begin{{tabular}}{{{'l' * len(kept)}}}", r"\toprule",
         rows[0], r"\midrule", *rows[1:], r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
     ])  # fmt: skip
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from tailgate.base.errors import InputError
 from tailgate.base.files import writable_directory
-from tailgate.base.progress import cells
+from tailgate.base.progress import cells, said
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite
 from tailgate.core.schema import digest
@@ -83,7 +83,10 @@ def try_out(
     entry = _entry(made, defence)
     if entry["status"] == "unattacked":
         say(f"attacking {defence}: {entry['why']}")
-        attack(suite, defence, folder / "attacked", workers=workers, progress=progress)
+        attack(
+            suite, defence, folder / "attacked", workers=workers, progress=progress,
+            announce=lambda seconds: say(f"the searches take about {said(seconds)}"),
+        )  # fmt: skip
         made = board_of(suite, folder, keep=keep, provisional=[defence])
         entry = _entry(made, defence)
     return Trial(made, path, entry)

@@ -166,10 +166,17 @@ class Harvest(NamedTuple):
     why: str = ""
 
 
+def _share(tell: Tell, number: int, members: int) -> Tell:
+    """Return a function that counts the steps of one member as a part of the whole search, in percent."""
+    return lambda done, total, text, mean: tell(100 * (number * total + done) // (members * total), 100, text, mean)
+
+
 def harvest(hunt: Hunt) -> list[Harvest]:
-    """Let every member search that is asked for; return what each found."""
-    out = []
-    for member in (one for one in MEMBERS if not hunt.only or one.name in hunt.only):
+    """Let every member search that is asked for; return what each found. `hunt.tell` is called with the share of the whole search."""
+    out, tell = [], hunt.tell
+    searching = [one for one in MEMBERS if not hunt.only or one.name in hunt.only]
+    for number, member in enumerate(searching):
+        hunt.tell = None if tell is None else _share(tell, number, len(searching))
         found, why = [], ""
         try:
             found = hunt.arena.best(member.find(hunt))

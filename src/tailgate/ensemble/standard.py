@@ -9,7 +9,9 @@ from __future__ import annotations
 import contextlib
 import json
 import tempfile
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +35,7 @@ from tailgate.evaluation.stats import proportion
 NAME = "standard-v1"
 BLACK = tuple(member.name for member in MEMBERS if member.knowledge == "black")
 SHOWN = 3  # attacks of a member that are kept
+PAUSE = 5.0  # between two looks at the progress of searches in other processes [s]
 Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
 
 
@@ -135,22 +138,71 @@ def searched(
     left = [i for i in range(len(jobs)) if i not in done]
     if announce is not None and left:
         announce(expected([jobs[i] for i in left], workers))
-    update("searches", len(done), len(jobs), "")
+    update("searches", 100 * len(done), 100 * len(jobs), f"{len(done)} of {len(jobs)}")
 
     def finish(number: int, result: dict[str, Any]) -> None:
         done[number] = result
         write_atomic(_file(jobs[number], folder), json.dumps(result, indent=1).encode() + b"\n")
         best = _best(result)
-        update("searches", len(done), len(jobs), f"{result['scenario']}: {best['damage']:.0%} by {best['attack']}" if best else "")
+        text = f", {result['scenario']}: {best['damage']:.0%} by {best['attack']}" if best else ""
+        update("searches", 100 * len(done), 100 * len(jobs), f"{len(done)} of {len(jobs)}{text}")
 
     if apart(workers, len(left)):
-        for number, result in each(one, [(jobs[i], folder) for i in left], workers):
-            finish(left[number], result)
+        notes = [_note(jobs[i], folder) for i in left]
+
+        def follow(percent: int) -> None:
+            update("searches", 100 * len(done) + percent, 100 * len(jobs), f"{len(done)} of {len(jobs)}")
+
+        with _followed(notes, follow):
+            for number, result in each(partial(_noted, one), [(jobs[i], folder) for i in left], workers):
+                finish(left[number], result)
     else:
         for i in left:
             label = f"{jobs[i].arena.scenario}, dose {jobs[i].arena.dose}"
             finish(i, one(jobs[i], folder, lambda n, of, text, mean, label=label: update(label, n, of, text)))  # type: ignore[misc]
     return [done[i] for i in range(len(jobs))]
+
+
+def _note(job: Job, folder: Path) -> Path:
+    """Return the file in which a search notes its progress."""
+    return _file(job, folder).with_suffix(".progress")
+
+
+def _noted(one: Callable[..., dict[str, Any]], job: Job, folder: Path) -> dict[str, Any]:
+    """Run one search in a process apart; while it runs, a file has its progress in percent."""
+    note = _note(job, folder)
+
+    def tell(done: int, total: int, *_: object) -> None:
+        with contextlib.suppress(InputError):  # progress is worth no search: the folder may be on another machine
+            write_atomic(note, b"%d" % (100 * done // total))
+
+    try:
+        return one(job, folder, tell)
+    finally:
+        with contextlib.suppress(OSError):
+            note.unlink()
+
+
+@contextlib.contextmanager
+def _followed(notes: Sequence[Path], update: Callable[[int], None]) -> Iterator[None]:
+    """Read these files every few seconds within the block, and call update(sum of their percents)."""
+    over = threading.Event()
+
+    def follow() -> None:
+        while not over.wait(PAUSE):
+            held = []
+            for note in notes:
+                with contextlib.suppress(OSError, ValueError):  # none yet, or finished in between
+                    held.append(int(note.read_bytes()))
+            update(sum(held))
+
+    thread = threading.Thread(target=follow, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 def _strongest(arena: Arena, attacks: Sequence[str]) -> dict[str, Any] | None:
@@ -287,5 +339,6 @@ def _compared(result: dict[str, Any], rows: list[dict[str, Any]], suite: Suite) 
 
 
 def attacks_of(report: dict[str, Any]) -> list[str]:
-    """Return the attacks that were found, each once, as `tailgate evaluate --attack` takes them."""
-    return list(dict.fromkeys(one["attack"] for cell in report["cells"] for one in cell["members"] if one["attack"]))
+    """Return the attacks that were found, each once, the most harmful first, as `tailgate evaluate --attack` takes them."""
+    found = [one for cell in report["cells"] for one in cell["members"] if one["attack"]]
+    return list(dict.fromkeys(one["attack"] for one in sorted(found, key=lambda one: -one["damage"])))
