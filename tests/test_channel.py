@@ -8,13 +8,14 @@ from hypothesis import strategies as st
 from tailgate.base.errors import InputError
 from tailgate.core import AIRED, Command, Kind, Received
 from tailgate.core.channel import Channel
+from tailgate.core.kinds import EFFECTS
 from tailgate.core.scenario import load_scenario
 from tailgate.core.threat import Brief, ThreatModel
 
 ALL = ("dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "delay", "replay")
 P, V, LP, LV, ACC = range(5)  # wires: position, velocity, leader's position and velocity, the acceleration command
 OLD = (Kind.DELAY, Kind.REPLAY)
-WIRED = [kind for kind in Kind if kind != Kind.NONE and kind not in AIRED]
+WIRED = [kind for kind in Kind if kind != Kind.NONE and kind not in AIRED and not EFFECTS[kind].inside]
 MODEL = load_scenario("stop-and-go-v0").brief().model
 EXPECTED = np.array([-1.0, -2.0, -3.0, -4.0, -5.0])
 

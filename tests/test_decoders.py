@@ -368,3 +368,28 @@ def test_the_exact_decoder_plays():
     assert not np.array_equal(*errors) and errors[1].max() < 3.0
     with pytest.raises(InputError, match="norm=1"):
         tailgate.make_defence("l1_decoder", solver="program")
+
+
+def test_the_program_without_all_readings_or_without_an_answer(linear_model, monkeypatch):
+    """It runs no rounds. Lost readings have no row; where the rest leaves the state open, or HiGHS stops, the steady filter's estimate stays."""
+    from scipy import optimize
+
+    from tailgate.estimators.sparse_attacks import l1_decoder
+
+    monkeypatch.setattr(l1_decoder, "decoded", None)
+    model = linear_model([[1.0, 0.1], [0.0, 1.0]], [[1.0, 0.0]] * 5, 1e-6 * np.eye(2), 1e-4 * np.eye(5))
+    defence = L1Decoder(s=1, window=4, norm=1, solver="program")
+    ys = (3.0 + 0.2 * np.arange(8.0))[:, None, None] * np.ones((1, 1, 5))
+    ys[4:, :, 0] = 40.0
+    valid = np.ones((8, 1, 5), bool)
+    valid[5:, :, 1:3] = False  # one liar of three that are heard, in the newest steps
+    _, out = play_readings(defence, model, np.where(valid, ys, 1e9), valid=valid)
+    assert out[7][1].x[0, 0] == pytest.approx([4.4, 2.0], abs=1e-9)
+    lost = valid.copy()
+    lost[5:] = False  # of the last window one step is left: no speed
+    _, out = play_readings(defence, model, np.where(lost, ys, 1e9), valid=lost)
+    assert np.array_equal(out[7][1].x, out[7][0].window.kalman.x) and not out[7][1].alarm.any() and out[7][1].score[0, 0] == 0.0
+    assert not np.array_equal(out[6][1].x, out[6][0].window.kalman.x)  # two steps tell the speed
+    monkeypatch.setattr(optimize, "linprog", lambda *args, **rest: type("Answer", (), {"status": 1, "x": np.full(22, 7.0), "message": "limit"}))
+    _, out = play_readings(defence, model, ys)
+    assert all(np.array_equal(estimate.x, state.window.kalman.x) for state, estimate in out)

@@ -28,8 +28,8 @@ from tailgate.play.trace import rollout
 from tailgate.studies.envelope import Settings, Signals, learn, sampled, upper
 from tailgate.studies.envelope_sources import from_log, from_scenarios, played
 
-LOOSE = Settings(margin=0.1, rate=1e-2)  # 299 held-out steps show it: one episode
-NARROW = Settings(margin=0.0, rate=1e-3)
+LOOSE = Settings(margin=0.1, rate=1e-2, unit="step")  # 299 held-out steps show it: one episode
+NARROW = Settings(margin=0.0, rate=1e-3, unit="step")
 SHIPPED = {"redundant": "redundant-two-v0", "car-following": "gusty-stop-and-go-v0"}
 
 
@@ -40,10 +40,10 @@ def sheet_of(z, u=None, settings=NARROW, held=None):
     signals = Signals(tuple(f"y{i + 1}" for i in range(z.shape[1])), (), 1, 0.1)
 
     def steps(values):
-        return sampled(values, np.ones(values.shape, bool), u[: len(values)], np.arange(len(values)) == 0)
+        return sampled(values, np.ones(values.shape, bool), u[: len(values)], np.arange(len(values)) == 0, np.zeros(len(values), int))
 
     found = learn(signals, steps(z), steps(z if held is None else held), settings)
-    return sealed(**signals._asdict(), made={}, invariants=tuple(found))
+    return sealed(sensors=signals.sensors, v2v=(), inputs=1, dt=0.1, made={}, invariants=tuple(found))
 
 
 def bounds(sheet, weights):
@@ -72,7 +72,7 @@ def scores(sheet, z, u=None, arrived=None):
 @pytest.mark.parametrize("margin", [0.0, 0.5, "gpd"])
 def test_a_constant_signal_learns_itself(margin):
     """A tail fitted to nothing would widen it."""
-    sheet = sheet_of(np.full((4000, 1), 7.25), settings=Settings(margin, rate=1e-3))
+    sheet = sheet_of(np.full((4000, 1), 7.25), settings=Settings(margin, rate=1e-3, unit="step"))
     assert bounds(sheet, {"y1": 1.0}) == (7.25, 7.25) and bounds(sheet, {"y1": 1.0, "last y1": -1.0}) == (0.0, 0.0)
     assert scores(sheet, [[7.25], [7.25]]).max() == 0.0 and scores(sheet, [[7.2501]])[0] > 1.0
 
@@ -114,7 +114,7 @@ def test_what_other_runs_leave_is_not_an_invariant():
     rng = np.random.default_rng(2)
     z = np.stack([rng.uniform(0.0, 1.0, 5000), rng.uniform(0.0, 1.0, 5000)], axis=1)
     other = z + np.array([0.0, 0.5])
-    kept = [one for one in sheet_of(z, settings=Settings(0.5, rate=1e-3), held=other).invariants if one.kind == "reading"]
+    kept = [one for one in sheet_of(z, settings=Settings(0.5, rate=1e-3, unit="step"), held=other).invariants if one.kind == "reading"]
     assert [one.weights for one in kept] == [{"y1": 1.0}]
     with pytest.raises(InputError, match=r"held_out.*2995 held-out steps"):
         sheet_of(z, held=z[:100])
@@ -302,7 +302,7 @@ def test_a_log_and_its_scenario_teach_the_same(tmp_path):
 
 def test_the_command_writes_what_it_prints(capsys, tmp_path):
     out = tmp_path / "mine.json"
-    assert main(["learn-envelope", "--scenario", "thesis-ch4-v0", "--episodes", "30", "--held-out", "30", "--rate", "1e-3", "--margin", "0.2", "--out", str(out), "--json"]) == 0
+    assert main(["learn-envelope", "--scenario", "thesis-ch4-v0", "--episodes", "30", "--held-out", "30", "--unit", "step", "--rate", "1e-3", "--margin", "0.2", "--out", str(out), "--json"]) == 0
     text = capsys.readouterr()
     assert json.loads(text.out) == json.loads(out.read_text()) and "learning: 100 %" in text.err
     sheet = load_envelope(out)
@@ -312,7 +312,7 @@ def test_the_command_writes_what_it_prints(capsys, tmp_path):
 
 
 @pytest.mark.parametrize("arguments, said", [
-    (["--scenario", "stop-and-go-v0", "--held-out", "3"], "held_out: got 3; expected at least 50 episodes"),
+    (["--scenario", "stop-and-go-v0", "--held-out", "3"], "held_out: got 3; expected at least 59 episodes"),
     (["--scenario", "stop-and-go-v0", "--scenario", "redundant-two-v0"], "scenario redundant-two-v0: sensors"),
     (["--scenario", "stop-and-go-v0", "--scenario", "stop-and-go-v0"], "each once"),
     (["--scenario", "stop-and-go-v0", "--margin", "wide"], "--margin"),

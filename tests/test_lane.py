@@ -289,3 +289,13 @@ def test_the_page_of_a_replay_has_the_lane(tmp_path):
     assert lane["offset"][:-1] == pytest.approx(trace.truth[:, 0, 0, 0].tolist(), abs=1e-3) and abs(lane["offset"][-1]) >= 1.75
     assert len(lane["curvature"]) == len(lane["offset"]) == len(lane["believed"]) + 1
     assert outcome(held).startswith("The car left its lane at t = ") and "OFF THE LANE" in write_page(held, tmp_path / "a.html").read_text()
+
+
+@pytest.mark.parametrize("field, value, said", [("speed", 25.0, r"speed: got 25\.0; expected the plant's lane_speed \(20\)"), ("front", 1.4, r"front: got 1\.4; expected the plant's front \(1\.1\)")])
+def test_stanleys_law_reckons_with_the_plants_car(field, value, said):
+    """Another speed or axle is refused before anything is played, and taken where the plant has it."""
+    with pytest.raises(InputError, match=said):
+        stanley(**{field: value}).brief()
+    plant = {"speed": "lane_speed", "front": "front"}[field]
+    place = stanley(**{field: value})
+    dataclasses.replace(place, plant=dataclasses.replace(place.plant, **{plant: value})).brief()

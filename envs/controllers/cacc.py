@@ -10,8 +10,8 @@ law is linear in X and in the V2V fields, so that the same matrices drive the ca
     u = K X + k0          tau_f f' = -f + G X + g0 + V v2v,      v2v_i = [a_{i-1}, a_0, u_{i-1}]
 """
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -74,6 +74,7 @@ class LawPlan(NamedTuple):
     normal: Tuned
     wide: Tuned  # Mode.WIDEN
     local: Tuned  # Mode.ACC
+    parts: tuple[Gains, Gains]  # what the error's gain adds to `normal`, and what that of its rate does
 
 
 class LawState(NamedTuple):
@@ -82,7 +83,14 @@ class LawState(NamedTuple):
 
 @dataclass(frozen=True)
 class Law:
-    """Base of the CACC laws: a subclass gives its `gains`; running them is the same for all."""
+    """Base of the CACC laws: a subclass gives its `gains`; running them is the same for all.
+
+    `error_gains` and `rate_gains` name the fields that weigh the spacing error and its rate, in which the law has to be linear. A law that
+    names none has no gains that an insider could scale.
+    """
+
+    error_gains: ClassVar[tuple[str, ...]] = ()
+    rate_gains: ClassVar[tuple[str, ...]] = ()
 
     headway: Lag = param(3.0, "time headway tau_h [s]")
     standstill: Length = param(5.0, "minimum stopping distance d_r [m]")
@@ -103,7 +111,14 @@ class Law:
             self.gains(model.graph, self.headway), self.gains(model.graph, WIDEN_FACTOR * self.headway),
             self.gains(model.graph, self.headway, local=True),
         )  # fmt: skip
-        return LawPlan(*(Tuned(gains, float(num.exp(-model.dt / gains.tau_f))) for gains in each))
+        normal, wide, local = (Tuned(gains, float(num.exp(-model.dt / gains.tau_f))) for gains in each)
+        return LawPlan(normal, wide, local, (self._part(model.graph, self.error_gains), self._part(model.graph, self.rate_gains)))
+
+    def _part(self, graph: Array, names: tuple[str, ...]) -> Gains:
+        """Return what the gains `names` add to the law's matrices."""
+        none = dict.fromkeys(self.error_gains + self.rate_gains, 0.0)
+        one, rest = (replace(self, **fields).gains(graph, self.headway) for fields in (none | {n: getattr(self, n) for n in names}, none))
+        return Gains(one.K - rest.K, one.k0 - rest.k0, one.G - rest.G, one.g0 - rest.g0, one.V - rest.V, one.tau_f)
 
     def start(self, plan: LawPlan, batch: int) -> LawState:
         return LawState(num.zeros((batch, len(plan.normal.gains.k0))))
@@ -120,9 +135,25 @@ class Law:
             if num.some(mode == other):
                 v, g = self._act(tuned, estimate.x, state.f, v2v)
                 u, f = np.where(mode == other, v, u), np.where(mode == other, g, f)
-        u = limited(obeyed(u, mode), self.accel_min, self.accel_max)
+        return LawState(f), self._within(obeyed(u, mode))
+
+    def scaled(
+        self, plan: LawPlan, state: LawState, estimate: Estimate, v2v: Array, odometry: Array, factors: Array
+    ) -> tuple[LawState, Array]:
+        """Return what `step` returns in Mode.NORMAL with the gains of error and rate times factors (B, N, 2) [-]."""
+        u, f = self._act(plan.normal, estimate.x, state.f, v2v)
+        nothing = num.zeros(f.shape)
+        for i, part in enumerate(plan.parts):
+            v, g = self._act(Tuned(part, plan.normal.keep), estimate.x, nothing, v2v)
+            more = factors[..., i] - 1.0
+            u, f = u + more * v, f + more * g
+        return LawState(f), self._within(u)
+
+    def _within(self, u: Array) -> Array:
+        """Return the commands (B, N, 1) within the car's limits."""
+        u = limited(u, self.accel_min, self.accel_max)
         u[:, 0] = 0.0  # the manoeuvre drives the leader
-        return LawState(f), u[..., None]
+        return u[..., None]
 
     def _act(self, tuned: Tuned, x: Array, f: Array, v2v: Array) -> tuple[Array, Array]:
         """Return u and the next f, each (B, N). A car knows its own f."""
@@ -158,6 +189,9 @@ class FeedForward(Law):
 
     Erratum: (6.7) is printed with w1 = w0 = 1, which feeds a steady acceleration forward twice.
     """
+
+    error_gains: ClassVar[tuple[str, ...]] = ("kp",)
+    rate_gains: ClassVar[tuple[str, ...]] = ("kd",)
 
     kp: Gain = param(0.5, "gain of the spacing error [1/s^2]")
     kd: Gain = param(1.0, "gain of its rate [1/s]")

@@ -6,7 +6,7 @@ known communication delays are zero here, as nothing is delayed.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -31,6 +31,9 @@ class Consensus(Law):
     brakes. Where each car hears cars ahead only, the loop is tau s^3 + s^2 + b s + k, stable for b > k tau. Without messages
     u_i = b (v_{i-1} - v_i) + k (d_i - d_r - tau_h v_i).
     """
+
+    error_gains: ClassVar[tuple[str, ...]] = ("k",)
+    rate_gains: ClassVar[tuple[str, ...]] = ("b",)
 
     b: Gain = param(0.8, "gain of the speed difference to the leader [1/s]")
     k: Gain = param(0.1, "gain of the mean position error among the neighbours [1/s^2]")

@@ -5,6 +5,7 @@ Control Systems Technology 22 (2014) 786-793.
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from tailgate.core import Array, param
 from tailgate.core.quantities import Gain
@@ -23,6 +24,9 @@ class Ploeg(Law):
     whatever the headway, is stable for kd > kp tau. Without the message a car drives on u_i = local_kp e_i + local_kd e_i': with the gains
     of the loop that has the message, cars that fall back amplify, and collide behind a leader that brakes.
     """
+
+    error_gains: ClassVar[tuple[str, ...]] = ("kp", "local_kp")
+    rate_gains: ClassVar[tuple[str, ...]] = ("kd", "local_kd")
 
     kp: Gain = param(0.1, "gain of the spacing error [1/s^2]")
     kd: Gain = param(0.5, "gain of its rate [1/s]")

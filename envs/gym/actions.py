@@ -12,7 +12,7 @@ from tailgate import num
 from tailgate.base.errors import InputError
 from tailgate.core import AIRED, Array, Command, Finite, Kind, Positive, PositiveCount, View, param
 from tailgate.core.channel import Channel, ChannelPlan
-from tailgate.core.kinds import KindName
+from tailgate.core.kinds import EFFECTS, KindName
 from tailgate.core.threat import Brief, fit, receivers
 
 ActionName = Literal["timing", "mode", "ramp", "continuous", "increment"]
@@ -72,6 +72,8 @@ class ActionCodec:
             if name not in threat.kinds:
                 granted = ", ".join(threat.kinds)
                 raise InputError("action", f"{self.spec.action} with {name}", f"a kind that the threat model grants: {granted}")
+        if self.discrete and used and all(EFFECTS[int(Kind[name.upper()])].inside for name in used):
+            raise InputError("action", f"{self.spec.action} with {', '.join(used)}", "a kind that a learner can choose: not insider")
         if self.discrete and "fdi" in used and abs(value) > threat.fdi_bound:
             raise InputError("value", value, f"at most the threat model's fdi_bound ({threat.fdi_bound}) in size")
         if self.discrete and "dos_jam" in used and not threat.jam_range[0] <= value <= threat.jam_range[1]:
@@ -137,6 +139,8 @@ class ActionCodec:
         for suffix, target in groups:
             for name in kinds:
                 kind = Kind[name.upper()]
+                if EFFECTS[int(kind)].inside:  # factors on gains are no sizes of a wire
+                    continue
                 if kind in AIRED:
                     out += [] if suffix.startswith(":") else self._aired(kind, suffix, target & receivers(self.brief))
                 elif kind == Kind.FDI and self.spec.action != "timing":

@@ -26,6 +26,7 @@ from tailgate.core.nouns import Lane
 from tailgate.core.quantities import Gap, Positive, PositiveSpeed, Spread, Step, Variance
 from tailgate.core.registry import register
 from tailgate.envs.controllers.lane_lqr import CURVATURE, STEERING
+from tailgate.envs.controllers.lane_stanley import LaneStanley
 from tailgate.envs.vehicle import SIGMAS
 
 STATES = 4
@@ -130,6 +131,12 @@ class LaneKeeping:
         return held(A, B, self.dt)
 
     def model(self, sensor: Sensor, controller: Controller) -> Model:
+        """Return the public model. Raise InputError for a controller that reckons with another car."""
+        if isinstance(controller, LaneStanley):
+            for field, own in (("speed", "lane_speed"), ("front", "front")):
+                if getattr(controller, field) != getattr(self, own):
+                    wanted = f"the plant's {own} ({getattr(self, own):g})"
+                    raise InputError(f"controller lane_stanley.{field}", getattr(controller, field), wanted)
         (A, B), (names, C, R) = self.dynamics(), sensor.matrices(self)
         row = np.eye(STATES)
         return Model(

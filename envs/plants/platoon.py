@@ -12,7 +12,7 @@ simulation, the linear closed loop on the true state. Erratum: the leader's four
 dropped.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -28,6 +28,7 @@ from tailgate.core.registry import register
 from tailgate.envs.controllers.cacc import PER_CAR, V2V, Column, Gains, Law
 from tailgate.envs.vehicle import SIGMAS, drive, lag
 
+GEARED = ("distance", "velocity")  # wires of the spacing error and of its rate
 Followers = Annotated[int, Field(ge=1, le=80)]
 Topology = Literal["predecessor_leader", "predecessor", "bidirectional", "two_predecessor"]
 Spreads = Annotated[tuple[Spread, Spread, Spread], Field(min_length=3, max_length=3)]
@@ -187,6 +188,12 @@ class Platoon(String):
     """A leader and followers with actuator lag, driven on what they believe of the string."""
 
     noise_var: Variances = param((0.0, 0.0, 0.0), "process noise variance a step of each car's position, speed and acceleration")
+
+    def model(self, sensor: Sensor, controller: Controller) -> Model:
+        """Return the public model. An insider can scale the gains of a car's law: that of the spacing error, and that of its rate."""
+        model = super().model(sensor, controller)
+        named = isinstance(controller, Law) and controller.error_gains and controller.rate_gains and {*GEARED} <= {*model.sensors}
+        return replace(model, gains=GEARED) if named else model
 
     def prepare(self, model: Model) -> PlatoonPlan:
         return PlatoonPlan(*lag(self.dt, self.tau), np.sqrt(np.array(self.noise_var)), model.graph[:, 0].astype(np.float64))

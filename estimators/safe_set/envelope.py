@@ -55,7 +55,7 @@ class Invariant(BaseModel):
     weights: Annotated[dict[str, Finite], Field(min_length=1, max_length=1000)]  # by signal, see `names_of`
     size: NonNegative  # the largest |weight x signal| of the clean runs
     bounds: Annotated[dict[Sign, Pair], Field(min_length=1)]
-    rates: dict[Sign, Probability]  # limit of the rate at which other clean steps leave the bounds, as if steps were independent
+    rates: dict[Sign, Probability]  # limit of the share of other clean episodes, or of steps (see `made`), that leave the bounds
 
 
 class Sheet(BaseModel):

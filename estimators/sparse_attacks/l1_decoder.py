@@ -11,6 +11,9 @@ With r = 1 this converges slowly. `solver=program` then takes the exact optimum,
 
     min sum_m t_m     s.t.  -t_m <= Y_m - O_m x <= t_m
 
+Missing readings have no row. Where the rows that are left do not determine x, or HiGHS finds no optimum, the estimate is that of the steady
+Kalman filter, as before the window is full.
+
 s sensors can be corrected where no x has sum_{i in K} |O_i x| >= sum_{i not in K} |O_i x| for any K of s sensors, without noise. Rows over
 the sensors' noise (`rows=sigmas`) break this where the most accurate sensors are attacked.
 """
@@ -74,18 +77,18 @@ def decoded(held: Windows, rounds: int) -> Array:
     return num.until(step, [first, begin], np.ones(first.shape[:2], bool), rounds)[0]
 
 
-def programmed(O: Array, Y: Array) -> Array:
-    """Return the x (n,) with the least sum of |Y - O x|, for rows O (M, n) and Y (M,). Raise InputError where HiGHS finds none."""
+def programmed(O: Array, Y: Array) -> Array | None:
+    """Return the x (n,) with the least sum of |Y - O x|, for rows O (M, n) and Y (M,); None where x stays open, or HiGHS finds none."""
     from scipy.optimize import linprog
 
     (count, n), slack = O.shape, -np.eye(len(O))
+    if count < n or np.linalg.matrix_rank(O) < n:
+        return None
     answer = linprog(
         np.array([*np.zeros(n), *np.ones(count)]), A_ub=np.concatenate([np.column_stack([O, slack]), np.column_stack([-O, slack])]),
         b_ub=np.concatenate([Y, -Y]), bounds=[(None, None)] * n + [(0.0, None)] * count, method="highs",
     )  # fmt: skip
-    if answer.status != 0:
-        raise InputError("l1_decoder: linear program", answer.message, "a solution")
-    return np.asarray(answer.x[:n])
+    return np.asarray(answer.x[:n]) if answer.status == 0 else None
 
 
 def grouped(O: Array, Y: Array, there: Array, norm: int) -> Windows:
@@ -128,11 +131,14 @@ class L1Decoder(Relaxed):
     def decode(self, plan: DecoderPlan, own: None, held: Centred) -> tuple[None, Decoded]:
         O, units = plan.window.O, plan.own[..., None]
         rows, Y = O * units[..., None], held.Y * units
-        x = decoded(grouped(rows, Y, held.there, self.norm), int(self.rounds))
+        known = None
         if self.solver == "program":
-            x = np.array(x)
+            x, known = num.zeros((*held.full.shape, O.shape[-1])), np.zeros_like(held.full)
             for b, i in np.argwhere(held.full).tolist():
                 there = held.there[b, i]
-                x[b, i] = programmed(rows[i][there], Y[b, i][there])
+                if (one := programmed(rows[i][there], Y[b, i][there])) is not None:
+                    x[b, i], known[b, i] = one, True
+        else:
+            x = decoded(grouped(rows, Y, held.there, self.norm), int(self.rounds))
         score = np.max(np.where(held.there, np.abs(held.Y - modelled(O, x)), 0.0), axis=(-2, -1))
-        return None, Decoded(x, score, score > self.threshold)
+        return None, Decoded(x, score, score > self.threshold, known)

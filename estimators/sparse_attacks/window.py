@@ -170,6 +170,7 @@ class Decoded(NamedTuple):
     x: Array  # (B, N, n) at the window's start
     score: Array  # (B, N)
     alarm: Array  # (B, N) bool
+    known: Array | None = None  # (B, N) bool: there is an answer; None: for all
 
 
 class DecoderPlan(NamedTuple):
@@ -217,8 +218,9 @@ class Decoder:
         window = window_step(plan.window, state.window, received, known_u)
         held = centred(plan.window, window)
         own, found = self.decode(plan, state.own, held)
-        x = np.where(held.full[..., None], num.matvec(plan.window.last, found.x) + held.xi, window.kalman.x)
-        score, alarm = np.where(held.full, found.score, 0.0), held.full & found.alarm
+        known = held.full if found.known is None else held.full & found.known
+        x = np.where(known[..., None], num.matvec(plan.window.last, found.x) + held.xi, window.kalman.x)
+        score, alarm = np.where(known, found.score, 0.0), known & found.alarm
         return DecoderState(window, own), Estimate(
             x, score, alarm, num.full(score.shape, Mode.NORMAL, np.int8), np.ones_like(alarm)
         )

@@ -36,9 +36,8 @@ def attack(
     """Make a suite's attackers against a defence, and play them on it. Finished work is neither made nor played again.
 
     Policies go to out/policies, rows to out/DEFENCE*.jsonl, what the ensemble found to out/found. seeds, episodes: instead of the suite's;
-    beacon: the round; changes: key=value of the training; counting: of the cells that are played; announce: called with the seconds that
-    searches will take, about. Raises InputError for a suite without a
-    plan.
+    beacon: the round; changes: key=value of the training; counting: of the cells that are played. `announce` is called with the seconds
+    that searches will take, about. Raises InputError for a suite without a plan.
     """
     plan = plan_of(suite)
     if plan.ensemble and not plan.learners and (changes or seeds is not None):

@@ -26,8 +26,11 @@ def add(commands: Commands) -> None:
                          help="how bounds are widened: gpd, a generalised Pareto tail (default), or a share of the half width")  # fmt: skip
     command.add_argument("--tail", type=float, default=1e-7, metavar="P",
                          help="chance of a step beyond a bound that the tail gives (default 1e-7)")  # fmt: skip
-    command.add_argument("--rate", type=float, default=1e-4, metavar="P",
-                         help="highest rate of violations of an invariant, by the held-out steps (default 1e-4)")  # fmt: skip
+    command.add_argument("--rate", type=float, metavar="P",
+                         help="highest share of held-out episodes, or steps, that leave an invariant (default 0.05, or 1e-4)")  # fmt: skip
+    command.add_argument("--unit", choices=("episode", "step"), default="episode",
+                         help="what is counted: episodes (default), or steps as if they were independent")  # fmt: skip
+    command.add_argument("--positions", action="store_true", help="learn bounds of places on the road too, which end a longer drive")
     command.add_argument("--out", required=True, metavar="FILE.json", help="file of the envelope")
     command.add_argument("--json", action="store_true", help="print the file's content as JSON")
     command.set_defaults(run=_learn)
@@ -37,13 +40,14 @@ def _learn(options: argparse.Namespace) -> int:
     from tailgate.studies.envelope import Settings, write_envelope
     from tailgate.studies.envelope_sources import from_log, from_scenarios
 
+    rate = options.rate if options.rate is not None else 0.05 if options.unit == "episode" else 1e-4
     margin: Any = options.margin
     if margin != "gpd":
         try:
             margin = float(margin)
         except ValueError:
             raise InputError("--margin", margin, "gpd, or a share of the half width, such as 0.1") from None
-    settings, out = Settings(margin, options.tail, options.rate), Path(options.out)
+    settings, out = Settings(margin, options.tail, rate, options.unit, options.positions), Path(options.out)
     if out.suffix != ".json":
         raise InputError("--out", options.out, "a path that ends with .json")
     with working() as update:

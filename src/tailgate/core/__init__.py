@@ -4,6 +4,7 @@ from tailgate.core.components import (
     Attack,
     Controller,
     Defence,
+    Geared,
     Manoeuvre,
     Paced,
     Plant,
@@ -35,7 +36,7 @@ from tailgate.core.quantities import Count, Discount, Finite, NonNegative, Posit
 
 __all__ = [
     "AIRED", "Air", "Array", "Attack", "Command", "Controller", "Count", "Defence", "Discount", "Estimate", "Finite", "Frame",
-    "Innovation", "Kind", "Lane", "Manoeuvre", "Mode", "Model", "NonNegative", "Paced", "Plant", "Positive", "PositiveCount", "Prior",
-    "Probability", "Received", "Receiver", "Recording", "Scene", "Sensor", "Sized", "View", "WhiteBox",
+    "Geared", "Innovation", "Kind", "Lane", "Manoeuvre", "Mode", "Model", "NonNegative", "Paced", "Plant", "Positive", "PositiveCount",
+    "Prior", "Probability", "Received", "Receiver", "Recording", "Scene", "Sensor", "Sized", "View", "WhiteBox",
     "no_command", "pair_of", "param",
 ]  # fmt: skip

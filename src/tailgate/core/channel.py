@@ -12,8 +12,8 @@ from tailgate.core.kinds import EFFECTS, Kind, Limits, Memory, Recording
 from tailgate.core.nouns import Air, Array, Command, Received, no_command
 from tailgate.core.threat import Brief, ThreatModel
 
-NONE, DOS_JAM, DROPOUT, REPLAY, NOISE_JAM, ECHO_DELAY = map(  # plain numbers: numpy looks for array methods of an enumeration's members
-    int, (Kind.NONE, Kind.DOS_JAM, Kind.DROPOUT, Kind.REPLAY, Kind.NOISE_JAM, Kind.ECHO_DELAY)
+NONE, DOS_JAM, DROPOUT, REPLAY, NOISE_JAM, ECHO_DELAY, INSIDER = map(  # plain numbers: numpy looks for methods of an enumeration's members
+    int, (Kind.NONE, Kind.DOS_JAM, Kind.DROPOUT, Kind.REPLAY, Kind.NOISE_JAM, Kind.ECHO_DELAY, Kind.INSIDER)
 )
 _VALUED, _ON_AIR, _RADIATED = (
     np.array([kind in EFFECTS and getattr(EFFECTS[kind], trait) for kind in map(int, Kind)]) for trait in ("valued", "over_air", "radiated")
@@ -33,6 +33,8 @@ class ChannelPlan(NamedTuple):
     air: bool
     recorded: int  # samples kept for delay and replay; 0 where neither is granted
     sealed: Array  # (w,) bool: the wires whose values are authenticated
+    geared: Array  # (N, w) bool: the wires whose signal a car's own law weighs by a gain
+    gears: tuple[int, ...]  # their places, in the order of the model's `gains`
 
 
 class ChannelState(NamedTuple):
@@ -79,7 +81,10 @@ class Channel:
         last = brief.horizon if threat.end is None else min(threat.end, brief.horizon)
         recorded = threat.memory if any(EFFECTS[kind].recorded for kind in np.flatnonzero(kinds).tolist()) else 0
         sensors = len(brief.model.sensors)
-        return ChannelPlan(threat, brief.granted, kinds, brief.limits, last, sensors, brief.model.air, recorded, brief.sealed)
+        gears = tuple(brief.model.wires.index(name) for name in brief.model.gains)
+        return ChannelPlan(
+            threat, brief.granted, kinds, brief.limits, last, sensors, brief.model.air, recorded, brief.sealed, brief.geared, gears,
+        )  # fmt: skip
 
     def start(self, plan: ChannelPlan, expected: Array, u: Array) -> ChannelState:
         """Return the memory at step 1; an early attack holds the expected links (B, N, q+p) and the first input u (B, N, m)."""
@@ -140,6 +145,8 @@ class Channel:
         state = state._replace(
             used=state.used + charged, burst=np.where(charged, state.burst + 1, 0), cooldown=cooldown, last=last,
         )  # fmt: skip
+        if plan.kinds[INSIDER]:  # the wires arrive as they were sent
+            hit = hit & (kind != INSIDER)[:, None, None]
         if num.some(begins_to_hold):
             state = state._replace(links=_hold(state.links, begins_to_hold), drives=_hold(state.drives, begins_to_hold))
         begins = (kind == REPLAY) & (state.played == 0)
@@ -172,6 +179,12 @@ class Channel:
         played = np.where(state.last.kind == REPLAY, state.played + 1, 0)
         return state._replace(drives=drives, played=played, taped=state.taped + 1), applied
 
+    def factors(self, plan: ChannelPlan, state: ChannelState) -> tuple[Array, Array]:
+        """Return the factors (B, N, gains) on the gains of each agent's own law, and (B, N) bool: an insider drives it."""
+        inside = state.last.target & (state.last.kind == INSIDER)[:, None, None]
+        scaled = num.stack([np.where(inside[..., w], state.last.value[..., w], 1.0) for w in plan.gears])
+        return scaled, inside.any(axis=2)
+
     def _legal(self, plan: ChannelPlan, command: Command) -> Array:
         """Return (B,) bool: the threat model grants kind, targets and values."""
         kind, value = command.kind, command.value
@@ -185,7 +198,9 @@ class Channel:
                     fits = effect.grants(plan.limits, value)
                     if effect.over_air:
                         fits = plan.air & (np.arange(value.shape[2]) < plan.sensors) & fits
-                    if plan.sealed.any() and not effect.over_air:  # a forged value is not accepted; an old one is until its key is known
+                    if effect.inside:  # an insider has the keys
+                        fits = plan.geared & fits
+                    elif plan.sealed.any() and not effect.over_air:  # a forged value is not accepted; an old one is until its key is known
                         fits = fits & (~plan.sealed | (effect.recorded & (value <= plan.threat.key_interval)))
                     ok = ok & ((kind != one)[:, None, None] | fits)
         return np.asarray(legal & ~(command.target & ~ok).any(axis=(1, 2)))
@@ -204,7 +219,7 @@ class Channel:
         command, out = state.last, sent
         target, value = command.target[..., wires], command.value[..., wires]
         recording = Recording(plan.recorded, *(part[:, None, None] for part in (state.taped, state.anchor, state.played)))
-        known = [kind for kind in np.flatnonzero(plan.kinds).tolist() if not EFFECTS[kind].over_air]
+        known = [kind for kind in np.flatnonzero(plan.kinds).tolist() if not (EFFECTS[kind].over_air or EFFECTS[kind].inside)]
         for kind in num.present(np.where(target.any(axis=(1, 2)), command.kind, NONE), known):
             hit, effect = target & (command.kind == kind)[:, None, None], EFFECTS[kind]
             given = np.where(hit, value, 1.0) if effect.recorded else value

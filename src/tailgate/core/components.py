@@ -166,6 +166,20 @@ class Controller(Protocol[P, S]):
         """Return the gap [m] that it steers for at a speed [m/s], elementwise."""
 
 
+@runtime_checkable
+class Geared(Controller[P, S], Protocol[P, S]):
+    """A controller whose law weighs signals by gains that an insider can scale: those that the model's `gains` names."""
+
+    def scaled(self, plan: P, state: S, estimate: Estimate, v2v: Array, odometry: Array, factors: Array) -> tuple[S, Array]:
+        """Return what `step` returns of a law with scaled gains, which obeys no mode. Every leaf of the state has (B, N) first.
+
+        Parameters
+        ----------
+        factors : (B, N, gains)
+            Multiples of the gains, in the order of the model's `gains`; 1 leaves the law as it is.
+        """
+
+
 class Manoeuvre(Protocol[P, S]):
     """The leader's driving."""
 

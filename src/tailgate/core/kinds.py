@@ -14,7 +14,7 @@ from tailgate import num
 from tailgate.base.pytree import Array
 
 FAINTEST = 1e-12  # power [W] or delay [m] that a command over the air has at least
-KindName = Literal["dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "delay", "replay", "noise_jam", "echo_delay"]
+KindName = Literal["dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "fdi", "delay", "replay", "noise_jam", "echo_delay", "insider"]
 
 
 class Kind(IntEnum):
@@ -30,6 +30,7 @@ class Kind(IntEnum):
     REPLAY = 7
     NOISE_JAM = 8
     ECHO_DELAY = 9
+    INSIDER = 10
 
 
 class Limits(NamedTuple):
@@ -41,6 +42,7 @@ class Limits(NamedTuple):
     memory: int  # longest delay, and longest window that is replayed [steps]
     power: float  # largest power of noise [W]
     delay: float  # largest extra range of a late echo [m]
+    gain: float  # largest |factor| on a gain of a car's own law [-]
 
 
 class Memory(NamedTuple):
@@ -69,6 +71,7 @@ class Effect:
     over_air: ClassVar[bool] = False  # one value reaches all that a receiver reads, and changes what it measures
     radiated: ClassVar[bool] = False  # a receiver that falls silent still hears it
     recorded: ClassVar[bool] = False  # needs what was sent before
+    inside: ClassVar[bool] = False  # alters the law that reads the wire; the wire itself arrives as it was sent
     code: ClassVar[str]  # words for pages: a short name, a name, what a receiver notices, the unit of the value (empty: that of the wire)
     title: ClassVar[str]
     does: ClassVar[str]
@@ -83,7 +86,7 @@ class Effect:
         return np.asarray(value == self.clip(limits, value))
 
     def reads(self, sent: Array, value: Array, memory: Memory, recording: Recording) -> Array:
-        """Return what the receiver reads (B, N, w) in place of `sent` (B, N, w). Kinds over the air change the measurement instead."""
+        """Return what the receiver reads (B, N, w) in place of `sent` (B, N, w). Other kinds change the measurement or the law."""
         raise TypeError(f"{type(self).__name__} must define reads()")
 
 
@@ -200,10 +203,21 @@ class EchoDelay(NoiseJam):
         return limits.delay
 
 
+class Insider(Effect):
+    """The car's own law weighs what it reads with `value` times its gain."""
+
+    kind = Kind.INSIDER
+    valued = inside = True
+    code, title, does, unit = "LAW", "insider", "the car's own law weighs that signal with so much of its gain", "of the gain"
+
+    def clip(self, limits: Limits, value: Array) -> Array:
+        return np.clip(value, -limits.gain, limits.gain)
+
+
 # by plain numbers: in every comparison with a member of an enumeration numpy looks for array methods of it
 EFFECTS: dict[int, Effect] = {
     int(effect.kind): effect()
-    for effect in (DosJam, DosHold, DosHoldFresh, Dropout, FalseData, Delay, Replay, NoiseJam, EchoDelay)
+    for effect in (DosJam, DosHold, DosHoldFresh, Dropout, FalseData, Delay, Replay, NoiseJam, EchoDelay, Insider)
 }
 AIRED = tuple(Kind(kind) for kind, effect in EFFECTS.items() if effect.over_air)
 

@@ -50,6 +50,7 @@ class Model:
     Row i of `gap` and `speed` (N, n) says how agent i's gap to the vehicle ahead and its own speed depend on x; a row of zeros, the
     default, is an agent without a road. `challenge` is the number of complex samples that a sensor which listens to its own echo takes
     while its probe is muted; 0, the default, is a sensor that does not: noise_jam and echo_delay reach only those that do (`air`).
+    `gains` names the wires whose signal the agents' own laws weigh by a gain that an insider can scale: the error, then its rate.
     `lane` is half of the width of a lane [m] whose nearer line takes the place of the car ahead; 0, the default, is a road with cars.
     """
 
@@ -68,6 +69,7 @@ class Model:
     speed: Array | None = None
     challenge: int = 0
     lane: float = 0.0
+    gains: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("A", "B", "c", "C", "Q", "R", "graph", "gap", "speed"):  # public, and nobody's to change: own copies, read-only

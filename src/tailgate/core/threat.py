@@ -15,6 +15,7 @@ from tailgate.core.quantities import Bound, Bounded, Count, PositiveCount, Time,
 
 Knowledge = Literal["black", "grey", "white"]
 KNOWLEDGE: tuple[Knowledge, ...] = get_args(Knowledge)  # each sees what the one before it sees, and more
+MOST_GAIN = 1e9  # of an unbounded insider
 Span = Annotated[int, Field(ge=1, le=10_000)]
 Pair = Annotated[tuple[Bounded, Bounded], Field(min_length=2, max_length=2)]
 
@@ -43,6 +44,7 @@ class ThreatModel:
     hold_from_onset: bool = param(False, "dos_hold keeps the last good sample before onset (6.18), not before the first hit", if_any=True)
 
     authenticated: tuple[str, ...] = param((), "wires whose values carry a tag: they may be held or lost, not forged", if_any=True)
+    gain_bound: Bound | None = param(None, "largest |factor| that an insider may put on a gain of a car's law; none: 1e9 [-]", if_any=True)
     key_interval: Count = param(0, "age up to which an authenticated value is accepted again, until its key is known [steps]", if_any=True)
 
     def __post_init__(self) -> None:
@@ -82,6 +84,12 @@ class Brief:
         return np.array([name in self.threat.authenticated for name in wires], bool)
 
     @property
+    def geared(self) -> Array:
+        """(N, w) bool: the wires whose signal an agent's own law weighs by a gain that an insider can scale."""
+        model = self.model
+        return np.asarray(model.followers[:, None] & np.array([name in model.gains for name in model.wires], bool))
+
+    @property
     def is_actuator(self) -> Array:
         """(w,) bool: the wires that lead to actuators."""
         model = self.model
@@ -97,7 +105,7 @@ class Brief:
         """The bounds of the values of commands."""
         threat, strongest = self.threat, self.threat.actuator_bound
         low, high = (np.where(self.is_actuator, sign * strongest, end) for sign, end in zip((-1.0, 1.0), threat.jam_range, strict=True))
-        return Limits(self.bounds, low, high, threat.memory, threat.jam_power, threat.delay_bound)
+        return Limits(self.bounds, low, high, threat.memory, threat.jam_power, threat.delay_bound, threat.gain_bound or MOST_GAIN)
 
     def command(self, on: Array, kind: Array | Kind, target: Array, value: Array | float) -> Command:
         """Return a command where `on` (B,) holds, else none. target and value broadcast to (B, N, w)."""

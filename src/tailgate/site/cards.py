@@ -29,7 +29,7 @@ ORDER = ("reference", "code", "licence", "uses", "authors", "threat_model", "tra
 NAMED = 4  # attacks of one card that are named
 BOUNDS = {  # of a threat model, and the kinds of attack that they bound
     "fdi_bound": {"fdi"}, "jam_range": {"dos_jam"}, "jam_power": {"noise_jam"}, "delay_bound": {"echo_delay"},
-    "memory": {"delay", "replay"},
+    "memory": {"delay", "replay"}, "gain_bound": {"insider"},
 }  # fmt: skip
 
 

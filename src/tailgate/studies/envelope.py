@@ -4,10 +4,13 @@ Templates of invariants, each a weighted sum g of signals:
 
     reading      y_i                                    component    a principal component with little of the variance
     change       y_i - y_i of the step before           regression   y_i less its least-squares fit by all other signals
-    difference   y_i - y_j, where narrower than both
+    difference   y_i - y_j of one unit, where narrower than both
 
-The training steps give the bounds of g: their extremes, widened by a margin. An invariant is kept if other clean steps leave its bounds
-rarely enough, by the one-sided Clopper-Pearson limit. Bounds for one sign of the known input are kept where they are tighter.
+Places on the road have no bounds: they enter by differences alone, so that a drive may be longer than those that were learned from.
+
+The training steps give the bounds of g: their extremes, widened by a margin. An invariant is kept if few enough other clean episodes leave
+its bounds, by the one-sided Clopper-Pearson limit. Steps of an episode are not independent, its agents neither; episodes are. The limit is
+that of all invariants that are tried together (Bonferroni). Bounds for one sign of the known input are kept where they are tighter.
 
 Messages count as signals. Agents share one envelope: a step of each is a sample.
 """
@@ -29,6 +32,7 @@ from tailgate.base.version import VERSION
 from tailgate.core import Array, Model
 from tailgate.estimators.safe_set.envelope import Invariant, Kind, Sheet, Sign, names_of, sealed
 from tailgate.evaluation.stats import limits
+from tailgate.studies.log_card import unit_of
 
 LEVEL = 0.95  # of the Clopper-Pearson limit
 TAIL_POINTS = 500  # largest values that a tail is fitted to
@@ -47,7 +51,9 @@ class Settings:
 
     margin: float | Literal["gpd"] = "gpd"  # share of the half width, or by a generalised Pareto tail
     tail: float = 1e-7  # chance of a step beyond a bound that the tail gives, on each side
-    rate: float = 1e-4  # highest rate of violations that an invariant may have
+    rate: float = 0.05  # highest share of clean episodes, or of steps, that may leave an invariant
+    unit: Literal["episode", "step"] = "episode"  # of the share; steps count as independent, and for each invariant by itself
+    positions: bool = False  # places on the road have bounds as well
 
     def __post_init__(self) -> None:
         if self.margin != "gpd" and not (isinstance(self.margin, (int, float)) and 0.0 <= self.margin <= 100.0):
@@ -55,19 +61,25 @@ class Settings:
         for name, value in (("tail", self.tail), ("rate", self.rate)):
             if not (isinstance(value, float) and 1e-12 <= value <= 0.1):
                 raise InputError(name, value, "a probability from 1e-12 to 0.1")
+        if self.unit not in ("episode", "step"):
+            raise InputError("unit", self.unit, "episode or step")
 
-    @property
-    def fewest(self) -> int:
-        """The fewest steps that can show the rate: without a violation among them."""
-        return math.ceil(math.log(1.0 - LEVEL) / math.log1p(-self.rate))
+    def chance(self, judged: int) -> float:
+        """Return the chance of missing the limit of one of `judged` invariants."""
+        return (1.0 - LEVEL) / (judged if self.unit == "episode" else 1)
+
+    def fewest(self, judged: int = 1) -> int:
+        """Return the fewest episodes or steps that can show the rate of one of `judged` invariants: without a violation among them."""
+        return math.ceil(math.log(self.chance(judged)) / math.log1p(-self.rate))
 
 
 class Samples(NamedTuple):
-    """Steps of clean runs: columns (S, D) as `names_of` has them, arrived (S, D) bool, negative (S,) bool: u below 0."""
+    """Steps of clean runs: columns (S, D) as `names_of` has them, arrived (S, D) bool, negative (S,) bool: u below 0, episode (S,) int."""
 
     columns: Array
     arrived: Array
     negative: Array
+    episode: Array
 
 
 class Signals(NamedTuple):
@@ -77,10 +89,22 @@ class Signals(NamedTuple):
     v2v: tuple[str, ...]
     inputs: int
     dt: float
+    units: tuple[str, ...] = ()  # of each signal; empty: all have one
+    places: tuple[bool, ...] = ()  # which signals are places on the road; empty: none
 
     @classmethod
     def of(cls, model: Model) -> Signals:
-        return cls(tuple(model.sensors), tuple(model.v2v), model.inputs, model.dt)
+        """Return the signals of a model. What no name tells of a sensor, the states tell that it reads."""
+        names, units = (*model.sensors, *model.v2v), [unit_of(name) for name in (*model.sensors, *model.v2v)]
+        places, apart = ["position" in name for name in names], any("position" in name for name in model.v2v)
+        assert model.gap is not None and model.speed is not None
+        gap, speed = ((rows != 0.0).any(axis=0) for rows in (model.gap, model.speed))
+        for i, unit in enumerate(units[: len(model.sensors)]):
+            read = (model.C[:, i] != 0.0).any(axis=0)
+            for known, name in ((speed, "m/s"), (gap, "m")):
+                if unit == "1" and read.any() and not (read & ~known).any():
+                    units[i], places[i] = name, apart and name == "m"  # a gap to a place that is sent is no state
+        return cls(tuple(model.sensors), tuple(model.v2v), model.inputs, model.dt, tuple(units), tuple(places))
 
     @property
     def both(self) -> tuple[str, ...]:
@@ -91,37 +115,50 @@ class Signals(NamedTuple):
         return names_of(self.both, self.inputs)
 
 
-def sampled(z: Array, arrived: Array, u: Array, begins: Array) -> Samples:
-    """Return samples of steps in their order: z (S, s), arrived (S, s) bool, u (S, m); begins (S,) bool: no step before."""
+def sampled(z: Array, arrived: Array, u: Array, begins: Array, episode: Array) -> Samples:
+    """Return samples of steps in their order: z (S, s), arrived (S, s) bool, u (S, m); begins (S,) bool: no step before; episode (S,)."""
     first = begins[:, None]
     z = np.where(arrived, z, 0.0)
     last, before = np.roll(z, 1, axis=0), np.roll(arrived, 1, axis=0) & ~first
     columns = np.concatenate([z, np.where(before, last, 0.0), u], axis=1)
     negative = u[:, 0] < 0.0 if u.shape[1] else np.zeros(len(u), bool)
-    return Samples(columns, np.concatenate([arrived, before, np.ones(u.shape, bool)], axis=1), negative)
+    return Samples(columns, np.concatenate([arrived, before, np.ones(u.shape, bool)], axis=1), negative, episode)
 
 
 def joined(parts: Sequence[Samples]) -> Samples:
-    """Return the samples of several runs."""
-    return Samples(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    """Return the samples of several runs, whose episodes are others."""
+    ends = np.cumsum([0] + [1 + int(part.episode.max(initial=-1)) for part in parts])
+    apart = [part._replace(episode=part.episode + end) for part, end in zip(parts, ends, strict=False)]
+    return Samples(*(np.concatenate(columns) for columns in zip(*apart, strict=True)))
 
 
 # -- templates
 
 
-def templates(names: Sequence[str], signals: int, samples: Samples) -> Iterator[tuple[Kind, Array]]:
-    """Yield kind and weights (D,) of candidates. Linear relations are fitted to the steps in which every signal arrived."""
-    columns, arrived = samples.columns, samples.arrived
+def templates(has: Signals, samples: Samples, positions: bool = False) -> Iterator[tuple[Kind, Array]]:
+    """Yield kind and weights (D,) of candidates. Linear relations are fitted to the steps in which every signal arrived.
+
+    Without `positions` the weights of places on the road add up to 0.
+    """
+    names, signals, columns, arrived = has.names, len(has.both), samples.columns, samples.arrived
+    free = [i for i in range(signals) if has.places and has.places[i] and not positions]
     unit = np.eye(len(names))
     spans = [np.ptp(columns[arrived[:, i], i]) if arrived[:, i].any() else 0.0 for i in range(signals)]
     for i in range(signals):
-        yield "reading", unit[i]
+        if i not in free:
+            yield "reading", unit[i]
         yield "change", unit[i] - unit[signals + i]
     for i, j in itertools.combinations(range(signals), 2):
         some = arrived[:, i] & arrived[:, j]
+        if has.units and (has.units[i] != has.units[j] or has.units[i] == "1"):
+            continue
         if some.any() and np.ptp(columns[some, i] - columns[some, j]) < NARROW * min(spans[i], spans[j]):
             yield "difference", unit[i] - unit[j]
     whole = columns[arrived.all(axis=1)]
+    moved = free + [signals + i for i in free]
+    if free:  # from the first of them; it rests then, and has no weight until the others' is taken from it
+        whole = whole.copy()
+        whole[:, moved] -= whole[:, free[:1]]
     if len(whole) <= 10 * len(names):
         return
     mean, spread = whole.mean(axis=0), whole.std(axis=0)
@@ -130,18 +167,23 @@ def templates(names: Sequence[str], signals: int, samples: Samples) -> Iterator[
     for place, i in enumerate(moving.tolist()):
         if i < signals and len(moving) > 1:
             fit = np.linalg.lstsq(np.delete(scaled, place, axis=1), scaled[:, place], rcond=None)[0]
-            yield "regression", _spread_out(np.insert(-fit, place, 1.0) * spread[i], moving, spread, len(names))
+            yield "regression", _spread_out(np.insert(-fit, place, 1.0) * spread[i], moving, spread, len(names), moved)
     variances, directions = np.linalg.eigh(scaled.T @ scaled / len(scaled))
     for variance, direction in zip(variances, directions.T, strict=True):
         if variance < SMALL:
-            yield "component", _spread_out(direction, moving, spread, len(names))
+            yield "component", _spread_out(direction, moving, spread, len(names), moved)
 
 
-def _spread_out(terms: Array, moving: Array, spread: Array, width: int) -> Array:
-    """Return weights (width,) from those of standardised columns, without terms that are nothing but rounding."""
+def _spread_out(terms: Array, moving: Array, spread: Array, width: int, moved: Sequence[int]) -> Array:
+    """Return weights (width,) from those of standardised columns, without terms that are nothing but rounding.
+
+    moved: columns less the first of them.
+    """
     terms = np.where(np.abs(terms) > NOTHING * np.abs(terms).max(), terms, 0.0)
     out = np.zeros(width)
     out[moving] = terms / spread[moving]
+    if len(moved):
+        out[moved[0]] = -sum(float(out[i]) for i in moved[1:])
     return out
 
 
@@ -185,24 +227,30 @@ def learn(signals: Signals, train: Samples, held_out: Samples, settings: Setting
 
     Every value of the training steps lies within the bounds.
     """
-    if len(held_out.columns) < settings.fewest:
-        wanted = f"at least {settings.fewest} held-out steps, to show a rate below {settings.rate:g}"
-        raise InputError("held_out", f"{len(held_out.columns)} steps", wanted)
-    candidates, out = list(templates(signals.names, len(signals.both), train)), []
+    candidates: list[tuple[Kind, Array]] = list(templates(signals, train, settings.positions))
+    out: list[Invariant] = []
+    judged = len(candidates) * (3 if signals.inputs else 1)  # with bounds for each sign of the input
+    fewest, unit = settings.fewest(judged), settings.unit
+    if (count := len(np.unique(held_out.episode)) if unit == "episode" else len(held_out.columns)) < fewest:
+        wanted = f"at least {fewest} held-out {unit}s, to show a rate below {settings.rate:g}"
+        raise InputError("held_out", f"{count} {unit}s", wanted)
     for done, (kind, weights) in enumerate(candidates, 1):
         bounds: dict[Sign, tuple[float, float]] = {}
         rates: dict[Sign, float] = {}
         used = np.flatnonzero(weights)
-        (g, below, size), (fresh, fresh_below, _) = (_values(samples, weights, used) for samples in (train, held_out))
-        choices: list[tuple[Sign, Array, Array]] = [("any", g, fresh)]
-        choices += [("negative", g[below], fresh[fresh_below]), ("positive", g[~below], fresh[~fresh_below])]
-        for sign, seen, other in choices:
-            if len(seen) < 10 * len(weights) or len(other) < settings.fewest:
+        (g, below, _, size), (fresh, fresh_below, episode, _) = (_values(samples, weights, used) for samples in (train, held_out))
+        choices: list[tuple[Sign, Array, Array]] = [("any", np.full(len(g), True), np.full(len(fresh), True))]
+        choices += [("negative", below, fresh_below), ("positive", ~below, ~fresh_below)] if signals.inputs else []
+        for sign, here, there in choices:
+            seen, other = g[here], fresh[there]
+            count = len(np.unique(episode[there])) if unit == "episode" else len(other)
+            if len(seen) < 10 * len(weights) or count < fewest:
                 continue
             low, high = bounds_of(seen, settings)
             slack = 1e-12 * size
-            outside = np.array(np.count_nonzero((other < low - slack) | (other > high + slack)))
-            rate = float(limits(outside, np.array(len(other)), 1.0 - LEVEL)[1])
+            outside = (other < low - slack) | (other > high + slack)
+            left = len(np.unique(episode[there][outside])) if unit == "episode" else np.count_nonzero(outside)
+            rate = float(limits(np.array(left), np.array(count), settings.chance(judged))[1])
             widest = bounds.get("any")
             if rate < settings.rate and (widest is None or high - low < TIGHTER * (widest[1] - widest[0])):
                 bounds[sign], rates[sign] = (low, high), float(f"{rate:.4g}")
@@ -212,18 +260,18 @@ def learn(signals: Signals, train: Samples, held_out: Samples, settings: Setting
         if progress is not None:
             progress("learning", done, len(candidates))
     if not out:
-        raise InputError("held_out", f"none of {len(candidates)} invariants", f"one that is left in fewer than {settings.rate:g} of steps")
+        raise InputError("held_out", f"none of {len(candidates)} invariants", f"one left in fewer than {settings.rate:g} of {unit}s")
     return out
 
 
-def _values(samples: Samples, weights: Array, used: Array) -> tuple[Array, Array, float]:
-    """Return g and the sign of u where all signals arrived, and the size of the largest term."""
+def _values(samples: Samples, weights: Array, used: Array) -> tuple[Array, Array, Array, float]:
+    """Return g, the sign of u and the episode where all signals arrived, and the size of the largest term."""
     some = samples.arrived[:, used].all(axis=1)
     terms = samples.columns[np.ix_(some, used)] * weights[used]
     g = np.zeros(len(terms))
     for column in terms.T:  # in the order of the defence's sums
         g += column
-    return g, samples.negative[some], float(np.abs(terms).max(initial=0.0))
+    return g, samples.negative[some], samples.episode[some], float(np.abs(terms).max(initial=0.0))
 
 
 def sheet_of(
@@ -234,7 +282,8 @@ def sheet_of(
 
     invariants = learn(signals, train, held_out, settings, progress)
     made |= {
-        "margin": settings.margin, "tail": settings.tail, "rate": settings.rate, "level": LEVEL, "tailgate": VERSION,
+        "margin": settings.margin, "tail": settings.tail, "rate": settings.rate, "level": LEVEL, "unit": settings.unit,
+        "positions": settings.positions, "tailgate": VERSION,
         "numpy": np.__version__, "scipy": scipy.__version__,
     }  # fmt: skip
     return sealed(sensors=signals.sensors, v2v=signals.v2v, inputs=signals.inputs, dt=signals.dt, made=made, invariants=tuple(invariants))

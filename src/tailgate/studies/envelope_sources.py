@@ -22,6 +22,7 @@ from tailgate.core.schema import read_model
 from tailgate.estimators.safe_set.envelope import Sheet
 from tailgate.studies.envelope import Progress, Samples, Settings, Signals, joined, sampled, sheet_of
 from tailgate.studies.log import SPLITS, pyarrow, steps
+from tailgate.studies.log_card import unit_of
 
 AT_ONCE = 64  # episodes that are played together
 
@@ -41,7 +42,8 @@ def played(place: Scenario, purpose: str, seeds: range, progress: Callable[[int]
             rows.append((z, arrived, state.known_u, np.broadcast_to(live[:, None], arrived.shape[:2])))
         by_episode = (np.moveaxis(np.array(column), 0, 2) for column in zip(*rows, strict=True))  # (B, N, steps, ...)
         z, arrived, u, driven = (column.reshape(-1, *column.shape[3:]) for column in by_episode)
-        made = sampled(z, arrived, u, np.arange(len(z)) % len(rows) == 0)
+        step = np.arange(len(z))
+        made = sampled(z, arrived, u, step % len(rows) == 0, step // (len(z) // len(some)))
         parts.append(Samples(*(column[driven] for column in made)))
         if progress is not None:
             progress(len(some))
@@ -61,9 +63,11 @@ def from_scenarios(names: Sequence[str], episodes: int, held_out: int, settings:
     signals = [Signals.of(place.brief().model) for place in places]
     for name, has in zip(names, signals, strict=True):
         _same(f"scenario {name}", has, signals[0])
-    fewest, longest = settings.fewest, sum(place.horizon * place.brief().model.agents for place in places)
-    if held_out * longest < fewest:
-        raise InputError("held_out", held_out, f"at least {math.ceil(fewest / longest)} episodes, to show a rate below {settings.rate:g}")
+    fewest, each = settings.fewest(), len(places)
+    if settings.unit == "step":
+        each = sum(place.horizon * place.brief().model.agents for place in places)
+    if held_out * each < fewest:
+        raise InputError("held_out", held_out, f"at least {math.ceil(fewest / each)} episodes, to show a rate below {settings.rate:g}")
     total, done, splits, counts = len(places) * (episodes + held_out), 0, [], {}
 
     def more(count: int) -> None:
@@ -97,13 +101,20 @@ class _Place(BaseModel):
     dt: Step
     config_hash: str
 
-    @property
-    def signals(self) -> Signals:
+    def signals(self, name: str) -> Signals:
+        """Return the signals of the scenario `name`: their units are those of its model, where the package has this very scenario."""
+        try:
+            place = load_scenario(name)
+        except InputError:
+            place = None
+        if place is not None and place.config_hash == self.config_hash:
+            return Signals.of(place.brief().model)
         names = [column.name for column in self.columns]
         readings, messages = (
             tuple(name.removeprefix(prefix) for name in names if name.startswith(prefix)) for prefix in ("reading_", "message_")
         )
-        return Signals(readings, messages, sum(name.startswith("known_input_") for name in names), self.dt)
+        return Signals(readings, messages, sum(name.startswith("known_input_") for name in names), self.dt,
+                       tuple(unit_of(name) for name in readings + messages), tuple("position" in name for name in readings + messages))
 
 
 class _File(BaseModel):
@@ -133,7 +144,7 @@ def from_log(folder: Path, scenarios: Sequence[str] | None, settings: Settings, 
     names = list(scenarios or held.scenarios)
     if strange := [name for name in names if name not in held.scenarios]:
         raise InputError("scenario", strange[0], f"one of the log: {', '.join(held.scenarios)}")
-    signals = [held.scenarios[name].signals for name in names]
+    signals = [held.scenarios[name].signals(name) for name in names]
     for name, has in zip(names, signals, strict=True):
         _same(f"scenario {name}", has, signals[0])
     files = [file for file in held.files if file.scenario in names]
@@ -189,4 +200,4 @@ def _read_file(folder: Path, file: _File, signals: Signals, driver: str) -> Samp
     fresh = np.concatenate([[True], np.diff(k) != 0]) | ~same  # clean episodes are the same at every dose
     order, k, same = order[fresh], k[fresh], same[fresh]
     begins = ~same | (np.diff(k, prepend=0) != 1)
-    return sampled(z[order], arrived[order], rest[order][:, p:], begins)
+    return sampled(z[order], arrived[order], rest[order][:, p:], begins, np.unique(held["episode"][order], return_inverse=True)[1])
