@@ -1,13 +1,17 @@
 """The documentation's examples run as they stand."""
 
+import dataclasses
 import importlib
 import json
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from tailgate.cli import main
 
 ROOT = Path(__file__).parents[1]
 PAGES = ["README.md", *(f"docs/{name.name}" for name in sorted((ROOT / "docs").glob("*.md")))]
@@ -210,3 +214,36 @@ def test_the_tables_of_robustness_are_those_of_the_files() -> None:
     played = {cells[1].strip(" `"): set("".join(cells[2:]).split()) for cells in (line.split("|") for line in table.splitlines() if line.startswith("| `"))}
     kinds = {name: {scenario.split("-")[-2] for scenario in load_suite(name).robustness} for name in list_suites()}
     assert played == {name: kind for name, kind in kinds.items() if kind}
+
+
+@pytest.fixture
+def creeping(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    (tmp_path / "myattack.py").write_text(_blocks("docs/new-attack.md", "python")[0], encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    yield tmp_path
+    sys.modules.pop("myattack", None)
+
+
+def test_the_new_attack_does_what_its_page_says(creeping: Path) -> None:
+    """At most 30 lines of code; the table of collisions comes out; the engine compiles it."""
+    from tailgate.core.scenario import load_suite
+    from tailgate.evaluation.cells import evaluate
+
+    code = [line for line in _blocks("docs/new-attack.md", "python")[0].splitlines() if line.strip()]
+    assert 10 < len(code) <= 30
+    suite = dataclasses.replace(load_suite("quick-v1"), scenarios=("gusty-stop-and-go-v0",))
+    rows = evaluate(suite, defences=["kf", "chi2_kf", "safe_state"], attacks=["myattack:Creeping", "myattack:Creeping:rate=-1"], seeds=50)
+    page = (ROOT / "docs/new-attack.md").read_text(encoding="utf-8")
+    for attack, name in (("myattack:Creeping", "`rate=-0.5`, the default"), ("myattack:Creeping:rate=-1", "`rate=-1`")):
+        shares = [sum(r["crashed"] for r in rows if (r["defence"], r["attack"]) == (d, attack)) / 50 for d in ("kf", "chi2_kf", "safe_state")]
+        assert f"| {name} | {' | '.join(f'{share:.0%}'.replace('%', ' %') for share in shares)} |" in page
+    assert main(["explain", "engine", "--scenario", "gusty-stop-and-go-v0", "--defence", "kf", "--attack", "myattack:Creeping"]) == 0
+
+
+def test_the_new_attack_has_a_name_once_it_is_registered(creeping: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import tailgate
+    from tailgate.core import registry
+
+    monkeypatch.setitem(registry._entries, "attack", dict(registry._entries["attack"]))
+    exec(_blocks("docs/new-attack.md", "python")[1], {})
+    assert tailgate.make_attack("creeping", rate=-1.0).rate == -1.0
