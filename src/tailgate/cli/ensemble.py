@@ -41,7 +41,7 @@ def _attack(options: argparse.Namespace) -> int:
     from tailgate.ensemble.standard import attack, attacks_of
 
     own_classes()
-    options.kept = "the same command goes on" if options.out else "nothing is kept: --out DIR would"
+    options.kept = "the same command goes on after the searches that are finished" if options.out else "nothing is kept: --out DIR would"
     doses = [scalar(text) for text in options.dose or ()]
     for dose in doses:
         if dose is not None and not isinstance(dose, int):

@@ -28,7 +28,7 @@ def add(actions: Commands) -> None:
     command.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2); change no result")
     add_options(command, "--engine", "--address")
     command.add_argument("--json", action="store_true", help="print the entry as JSON")
-    command.set_defaults(run=_try, kept="the same command goes on")
+    command.set_defaults(run=_try, kept="the same command goes on after the searches that are finished")
 
 
 def _try(options: argparse.Namespace) -> int:

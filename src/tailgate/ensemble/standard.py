@@ -35,6 +35,7 @@ from tailgate.evaluation.stats import proportion
 NAME = "standard-v1"
 BLACK = tuple(member.name for member in MEMBERS if member.knowledge == "black")
 SHOWN = 3  # attacks of a member that are kept
+REST = 2.5  # a whole search over its searched episodes: confirming, learning, white boxes and gradients take as long again, and more
 PAUSE = 5.0  # between two looks at the progress of searches in other processes [s]
 Progress = Callable[[str, int, int, str], None]  # label, done, total, figures
 
@@ -92,12 +93,12 @@ def jobs_of(suite: Suite, defence: str, scenarios: Sequence[str], doses: Sequenc
 
 
 def expected(jobs: Sequence[Job], workers: int) -> float:
-    """Return the seconds that searches take, as the speed of the first one's scripts says."""
+    """Return the seconds that searches take, about, from the speed of the first one's scripts."""
     arena = jobs[0].arena
     if not arena.space.families:
         return 0.0
     steps = sum(BUDGETS[job.budget].episodes(job.arena.loop.model.agents) * job.arena.loop.horizon for job in jobs)
-    return steps / (arena.speed() * arena.loop.horizon) / min(workers, len(jobs))
+    return REST * steps / (arena.speed() * arena.loop.horizon) / min(workers, len(jobs))
 
 
 def search(job: Job, folder: Path, tell: Callable[[int, int, str, float], None] | None = None) -> dict[str, Any]:
