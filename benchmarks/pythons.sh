@@ -23,12 +23,13 @@ if [ $# -eq 0 ]; then
 fi
 [ $# -gt 0 ] || { echo "no Python from 3.11 on was found" >&2; exit 1; }
 
-install() { "$1" -m pip install --quiet --constraint "$root/constraints.txt" "$2"; "$1" -m pip check >/dev/null; }
+install() { "$1" -m pip install --quiet --constraint "$root/constraints.txt" "$2" && "$1" -m pip check; }
+quiet() { "$@" >"$work/log" 2>&1 || { cat "$work/log"; return 1; }; }
 stage() { now=$(date +%s); echo "$found  $1  $((now - then)) s"; then=$now; }
 
 "$1" -m venv "$work/build"
 "$work/build/bin/python" -m pip install --quiet build twine check-wheel-contents
-"$work/build/bin/python" -m build --outdir "$work/dist" . >"$work/build.log" 2>&1 || { cat "$work/build.log"; exit 1; }
+quiet "$work/build/bin/python" -m build --outdir "$work/dist" .
 "$work/build/bin/python" -m twine check --strict "$work"/dist/*
 "$work/build/bin/check-wheel-contents" "$work"/dist/*.whl
 wheel=$(ls "$work"/dist/*.whl) sdist=$(ls "$work"/dist/*.tar.gz)
@@ -67,11 +68,11 @@ for python in "$@"; do
     (
       cd "$work/play"
       "$bin/python" "$work/first.py"
-      "$bin/tailgate" list defences >/dev/null
-      "$bin/tailgate" evaluate --suite quick-v0 --scenario gusty-stop-and-go-v0 --seeds 5 --defence kf --attack none --out rows.jsonl >/dev/null 2>&1
-      "$bin/tailgate" leaderboard build --rows rows.jsonl --out page >/dev/null
+      quiet "$bin/tailgate" list defences
+      quiet "$bin/tailgate" evaluate --suite quick-v0 --scenario gusty-stop-and-go-v0 --seeds 5 --defence kf --attack none --out rows.jsonl
+      quiet "$bin/tailgate" leaderboard build --rows rows.jsonl --out page
       test -s page/index.html
-      "$bin/python" -m tailgate.evaluation.golden --check --scenario stop-and-go-v0 --scenario radar-following-v0
+      quiet "$bin/python" -m tailgate.evaluation.golden --check --scenario stop-and-go-v0 --scenario radar-following-v0
     )
     stage "$what played"
   done
@@ -80,9 +81,9 @@ for python in "$@"; do
   stage "extra train installed"
   (
     cd "$work/play"
-    "$bin/tailgate" train steps=1000 >/dev/null 2>train.log || { cat train.log; exit 1; }
-    "$bin/tailgate" train --config gusty steps=1280 'ppo={envs: 16, rollout: 40, batch_size: 160, epochs: 1}' episodes=12 \
-      "rivals=['fdi:trigger=near,threshold=30']" 'others=[]' 'white_box=[]' name=ppo >/dev/null 2>train.log || { cat train.log; exit 1; }
+    quiet "$bin/tailgate" train steps=1000
+    quiet "$bin/tailgate" train --config gusty steps=1280 'ppo={envs: 16, rollout: 40, batch_size: 160, epochs: 1}' episodes=12 \
+      "rivals=['fdi:trigger=near,threshold=30']" 'others=[]' 'white_box=[]' name=ppo
   )
   stage "trained"
   "$bin/python" -m pip install --quiet --constraint constraints.txt pytest pytest-xdist hypothesis
