@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo docs test test-long nightly lint bench crash fuzz clean
+.PHONY: demo docs wheels test test-long nightly lint bench crash fuzz clean
 
 demo: $(VENV)/.ready  ## train an adversary against a gated Kalman filter, compare it with scripted attacks, write the page
 	$(BIN)/python train.py
@@ -24,6 +24,9 @@ lint: $(VENV)/.ready
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+wheels:  ## wheel and sdist in empty environments of each Python that is found, some minutes each; LIGHT=1 without torch
+	sh benchmarks/pythons.sh
 
 bench: $(VENV)/.ready  ## speed beside the peers, in one run; writes benchmarks/results/speed.*
 	$(BIN)/python -m tailgate bench --out benchmarks/results

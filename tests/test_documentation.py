@@ -203,7 +203,8 @@ def _shown(cell: dict[str, Any]) -> list[str]:
 def test_a_tutorial_runs_to_the_outputs_that_it_shows(path: Path) -> None:
     nbclient = pytest.importorskip("nbclient", reason="the extra docs is not installed")
     nbformat = pytest.importorskip("nbformat")
-    for name in ("ipykernel", "pandas", "matplotlib"):
+    text = path.read_text(encoding="utf-8")
+    for name in ("ipykernel", "pandas", "matplotlib", *(["torch"] if "import torch" in text else [])):
         pytest.importorskip(name)
     held = nbformat.read(path, as_version=4)
     assert path.stat().st_size < 150_000
@@ -211,7 +212,9 @@ def test_a_tutorial_runs_to_the_outputs_that_it_shows(path: Path) -> None:
     fresh = nbformat.read(path, as_version=4)
     nbclient.NotebookClient(fresh, timeout=120, kernel_name="python3", resources={"metadata": {"path": str(path.parent)}}).execute()
     for old, new in zip(held.cells, fresh.cells, strict=True):
-        if old.cell_type == "code":
+        if old.cell_type == "code" and "measured" in old.metadata.get("tags", ()):
+            assert _shown(new)  # it differs from machine to machine
+        elif old.cell_type == "code":
             assert _shown(new) == _shown(old), old.source
 
 

@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from tailgate.base.version import ALIKE
+from tailgate.board.files import load
+
 ROOT = Path(__file__).parents[1]
 CONFIG = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 FOLDERS = CONFIG["tool"]["setuptools"]["package-dir"]
@@ -44,6 +47,22 @@ def test_package_data_covers_every_data_file() -> None:
             if p.is_file() and p.suffix != ".py" and "__pycache__" not in p.parts and not children & set(p.resolve().parents) - set((ROOT / folder).resolve().parents)
         }  # fmt: skip
         assert data == matched, name
+
+
+def test_one_version_is_said_everywhere() -> None:
+    """The package, how to cite it, and the newest release of the changelog, with one date; above that is what is not released."""
+    released = re.findall(r"^## \[(.+?)\](?: - (\S+))?$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), flags=re.M)
+    cited = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    (version, date), own = released[1], CONFIG["project"]["version"]
+    assert released[0] == ("Unreleased", "") and version == own and date
+    assert f"\nversion: {own}\n" in cited and f"\ndate-released: {date}\n" in cited
+    assert own not in ALIKE and ALIKE[-1] == released[2][0]
+
+
+def test_published_boards_are_of_versions_that_play_the_same() -> None:
+    boards = [*(ROOT / "results").glob("*/board.json*"), *(ROOT / "configs/boards").iterdir()]
+    assert len(boards) >= 10
+    assert {load(path)["suite"]["version"] for path in boards} <= {*ALIKE, CONFIG["project"]["version"]}
 
 
 def test_no_module_shadows_a_well_known_name() -> None:

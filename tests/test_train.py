@@ -136,7 +136,9 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_the_command_trains_compares_and_writes_a_page(here: Path, tmp_path: Path, small_run: tuple[str, ...]) -> None:
+def test_the_command_trains_compares_and_writes_a_page(
+    here: Path, tmp_path: Path, small_run: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     arguments = [*small_run, "others=[kf]", "workers=2", "--json"]
     done = subprocess.run([*COMMAND, *arguments], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -152,6 +154,10 @@ def test_the_command_trains_compares_and_writes_a_page(here: Path, tmp_path: Pat
     assert cli.main(["train", "steps=1920", "--resume"]) == 0  # the rest of the configuration is the run's own
     decisions = json.loads((run / "policy-0.json").read_text())["training"]["steps"]
     assert decisions == 1920 and f"{decisions:,} decisions" in (run / "page" / "index.html").read_text(encoding="utf-8")
+    monkeypatch.setitem(sys.modules, "sklearn.tree", None)  # not installed: a page without rules, no lost run
+    assert cli.main(["train", "--resume"]) == 0
+    assert "no rules are made of the policy: scikit-learn is missing: pip install 'tailgate[train]'" in capsys.readouterr().err
+    assert "No rules were made of it: scikit-learn is missing" in (run / "page" / "index.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.long

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 import tailgate
+from tailgate.base.version import ALIKE, plays_as
 from tailgate.cli import verify as command
 from tailgate.core.scenario import Suite, load_suite
 from tailgate.evaluation import cells as evaluation
@@ -38,6 +39,13 @@ def test_honest_rows_are_verified(rows: list[dict[str, Any]]) -> None:
     assert report["status"] == "verified" and report["counts"] == {"verified": 36, "differs": 0, "unchecked": 0}
     assert report["entries"] == [{"defence": "kf", "status": "verified", "verified": 36, "differs": 0, "unchecked": 0}]
     assert report["findings"] == [] and json.loads(json.dumps(report)) == report
+
+
+def test_rows_of_a_version_that_plays_the_same_are_verified_and_scored_with_others(rows: list[dict[str, Any]]) -> None:
+    older = [row | {"version": ALIKE[-1]} for row in rows]
+    assert verify(older)["counts"] == {"verified": 36, "differs": 0, "unchecked": 0}
+    assert _one(rows, version=ALIKE[-1], min_gap=1.0)["counts"]["differs"] == 1
+    assert plays_as(ALIKE[-1]) == tailgate.__version__ and plays_as("0.0.1") == "0.0.1"
 
 
 def test_a_row_is_the_same_with_other_workers_batches_and_companions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tailgate.base.errors import InputError
+from tailgate.base.version import plays_as
 from tailgate.core import Array
 from tailgate.core.scenario import Scenario, Suite, load_scenario
 from tailgate.core.threat import KNOWLEDGE
@@ -172,7 +173,7 @@ def tabulate(rows: Iterable[Row], suite: Suite, added: Sequence[str] = (), withd
         _same_cell(key, next(iter(by_seed.values()), row), row)
         _same_result(key, by_seed.setdefault(row["seed"], row), row)
     for field in ("purpose", "version", "beacon"):
-        found = sorted({str(row.get(field, "")) for row in rows})
+        found = sorted({_of_one(field, row.get(field, "")) for row in rows})
         if len(found) > 1:
             raise InputError(f"rows: {field}", found, "rows of one")
     _same_component(rows)
@@ -252,9 +253,14 @@ def _belongs(row: Row, suite: Suite, scenarios: dict[str, Scenario]) -> None:
         raise InputError("rows: knowledge", row["knowledge"], f"one of {', '.join(KNOWLEDGE)}")
 
 
+def _of_one(field: str, value: object) -> str:
+    """Return a field of a row as rows of one board share it: versions that play the same are one."""
+    return plays_as(value) if field == "version" else str(value)
+
+
 def _same_cell(key: Key, one: Row, other: Row) -> None:
     for field in ("config_hash", "defence_digest", "attack_digest", "version"):
-        if one[field] != other[field]:
+        if _of_one(field, one[field]) != _of_one(field, other[field]):
             raise InputError(f"rows of {named(key)}: {field}", [one[field], other[field]], "rows of one")
 
 

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from tailgate.base.errors import InputError, said, unknown, wanted
 from tailgate.base.files import sweep, write_atomic
 from tailgate.base.reading import load_json
-from tailgate.base.version import VERSION
+from tailgate.base.version import VERSION, plays_as
 from tailgate.core.scenario import Suite, list_suites, load_suite
 from tailgate.evaluation.stats import mean_time
 
@@ -171,8 +171,8 @@ def suite_of(board: Board) -> Suite:
 def agree(board: Board, suite: Suite) -> None:
     """Raise InputError for a board of another suite or version than is here."""
     held = board.suite
-    if held.version != VERSION:
-        raise InputError("board: suite.version", held.version, f"{VERSION}, which is here")
+    if plays_as(held.version) != VERSION:
+        raise InputError("board: suite.version", held.version, f"{VERSION}, which is here, or one that plays the same")
     if held.hash != suite.hash:
         raise InputError("board: suite.hash", held.hash, f"{suite.hash}, which the suite {suite.name} has here")
     if held.episodes is None or not 1 <= held.episodes <= 4096:

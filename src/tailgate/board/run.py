@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tailgate.base.errors import InputError
 from tailgate.base.reading import lines_of, parse_json
-from tailgate.base.version import VERSION
+from tailgate.base.version import VERSION, plays_as
 from tailgate.core.scenario import Suite
 from tailgate.evaluation.attack_list import attacks_of, list_of
 from tailgate.evaluation.cells import evaluate
@@ -104,7 +104,7 @@ def board_of(
     path = board_in(folder)
     before = kept_board(path, suite, beacon or "", provisional) if keep else load(path) if path.is_file() else None
     parts = {path: read_rows(path) for path in files}
-    if keep and (other := {row["version"] for rows in parts.values() for row in rows} - {VERSION}):
+    if keep and (other := {plays_as(row["version"]) for rows in parts.values() for row in rows} - {VERSION}):
         raise InputError("rows: version", min(other), f"{VERSION}, as the board's")
     board = score(
         (row for rows in parts.values() for row in rows), suite, attacks=list_of(suite, folder / LIST),

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from tailgate.base.errors import InputError
+from tailgate.base.version import plays_as
 from tailgate.core.scenario import Suite
 from tailgate.core.threat import KNOWLEDGE
 from tailgate.evaluation.rows import CLEAN
@@ -137,7 +138,8 @@ def with_kept(board: Data, old: Data) -> Data:
     not of the format.
     """
     before = read_board(old, "board.json")
-    if any(old["suite"].get(key) != board["suite"][key] for key in ("hash", "version", "beacon")):
+    was, now = ((suite.get("hash"), plays_as(suite.get("version")), suite.get("beacon")) for suite in (old["suite"], board["suite"]))
+    if was != now:
         return board
     kept, fields = _unchanged(board, before), dict[str, Data]()
     for entry in (entry for entry in old["entries"] if entry["defence"] in kept):

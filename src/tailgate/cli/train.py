@@ -130,6 +130,8 @@ def _learned(config: TrainConfig, report: dict[str, Any], rows: list[dict[str, A
     found = learned(Path(policy), config.scenario, config.defence, dict(config.threat), own, config.directory)
     if found is None:
         return None
+    if found["without"]:
+        Console(stderr=True).print(f"no rules are made of the policy: {found['without']}", markup=False, highlight=False, soft_wrap=True)
     wanted = Filter(defence=config.defence, attack=policy, scenario=config.scenario)
     page = write_page(play(choose(own, wanted).row, wanted), config.directory / "page" / "replay.html", policy)
     return found | {"replay": page.name}

@@ -18,7 +18,7 @@ from typing import Any
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
 from tailgate.base.reading import YAML_ENDS
-from tailgate.base.version import VERSION
+from tailgate.base.version import VERSION, plays_as
 from tailgate.core import draws
 from tailgate.core.registry import SANDBOXES, Family, Spec
 from tailgate.core.scenario import list_scenarios, load_scenario
@@ -30,8 +30,9 @@ from tailgate.evaluation.rounds import seeds_of
 from tailgate.evaluation.rows import Row
 
 HASHES = ("trace_hash", "decision_hash")
-# What a row says of itself that is not compared: who its companions were, the words of a failure, and what the row alone can say.
-FREE = frozenset({"batch", "cell", "reason", "seed", "suite", "purpose"})
+# What a row says of itself that is not compared: who its companions were, the words of a failure, and what the row alone can say. Its
+# version is looked at before.
+FREE = frozenset({"batch", "cell", "reason", "seed", "suite", "purpose", "version"})
 BYTES = 10_000_000  # of a file that a row names, at most
 ROUND = 4096  # episodes of a round that are looked through for a seed
 VERDICTS = ("verified", "differs", "unchecked")
@@ -155,7 +156,7 @@ class _Cells:
         lacks = [name for name in (*HASHES, "threat_model", "engine", "versions") if name not in row]
         if lacks:
             raise Unplayable(f"the row does not record {', '.join(lacks)}")
-        if row["version"] != VERSION:
+        if plays_as(row["version"]) != VERSION:
             raise Unplayable(f"made with tailgate {row['version']}; this is {VERSION}")
         if row["engine"] != ENGINE:
             raise Unplayable(f"made with the engine {row['engine']!r}; this is {ENGINE!r}")

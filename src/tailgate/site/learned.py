@@ -27,6 +27,8 @@ Data = dict[str, Any]
 def learned(policy: Path, scenario: str, defence: str, threat: dict[str, Any], rows: Sequence[Row], folder: Path) -> Data | None:
     """Return what a page shows of a learned policy. Rules are written to `folder`. None where nobody drives.
 
+    Without scikit-learn there are no rules, and `without` says so.
+
     threat: changes of the scenario's threat model. rows: of the policy against the defence.
     """
     text = str(policy)
@@ -37,13 +39,16 @@ def learned(policy: Path, scenario: str, defence: str, threat: dict[str, Any], r
     seeds = [row["seed"] for row in rows if row["status"] == "ok"][:TRIED]
     trace = rollout(loop, who.policy, draws.keys("report", seeds))
     shown = [i for i in range(len(seeds)) if (trace.kind[: trace.length[i], i] != 0).any()][:EPISODES]
+    without = None
     try:
         file, episodes = folder / "rules.json", max(len(rows), 1)
         found: Data | None = distil(text, file, scenario=scenario, defence=defence, threat=threat, loss=LOSS, episodes=episodes)
     except InputError:  # a policy with a memory, or with values that it chooses freely
         found = None
+    except ImportError as error:  # the policy is there, whatever else is installed
+        found, without = None, str(error)
     return {
-        "rules": found, "episodes": [_episode(trace, i, seeds[i]) for i in shown], "of": len(seeds),
+        "rules": found, "without": without, "episodes": [_episode(trace, i, seeds[i]) for i in shown], "of": len(seeds),
         "idle": sum(not (trace.kind[: trace.length[i], i] != 0).any() for i in range(len(seeds))),
     }  # fmt: skip
 

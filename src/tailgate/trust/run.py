@@ -22,6 +22,7 @@ from tailgate.base.files import remove, set_aside, sweep, writable_directory, wr
 from tailgate.base.locks import alone
 from tailgate.base.pool import apart, each
 from tailgate.base.reading import lines_of, parse_json
+from tailgate.base.version import plays_as
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_scenario
 from tailgate.core.schema import as_data
@@ -209,7 +210,8 @@ def with_trust(board: dict[str, Any], found: object, where: str = "trust", suite
         raise InputError(f"{where}: format", found.get("format") if isinstance(found, Mapping) else found, FORMAT)
     try:
         for name, mine, other in (
-            ("suite", found["suite"]["name"], board["suite"]["name"]), ("version", found["version"], board["suite"]["version"]),
+            ("suite", found["suite"]["name"], board["suite"]["name"]),
+            ("version", plays_as(found["version"]), plays_as(board["suite"]["version"])),
             ("beacon", found["beacon"], board["suite"].get("beacon", "")),
             ("formulas", found["formulas"], []), ("rule", found["rule"]["name"], "fixed"),
         ):  # fmt: skip
