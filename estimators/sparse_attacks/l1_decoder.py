@@ -82,13 +82,27 @@ def programmed(O: Array, Y: Array) -> Array | None:
     from scipy.optimize import linprog
 
     (count, n), slack = O.shape, -np.eye(len(O))
-    if count < n or np.linalg.matrix_rank(O) < n:
+    if count < n or dependent(O):
         return None
     answer = linprog(
         np.array([*np.zeros(n), *np.ones(count)]), A_ub=np.concatenate([np.column_stack([O, slack]), np.column_stack([-O, slack])]),
         b_ub=np.concatenate([Y, -Y]), bounds=[(None, None)] * n + [(0.0, None)] * count, method="highs",
     )  # fmt: skip
     return np.asarray(answer.x[:n]) if answer.status == 0 else None
+
+
+def dependent(O: Array) -> bool:
+    """Return True if a column of O (M, n) is a combination of those before it, by Gram and Schmidt."""
+    found: list[Array] = []
+    for column in O.T:
+        rest = column
+        for one in found:
+            rest = rest - num.dot(one, rest) * one
+        size = num.dot(rest, rest)
+        if size <= STILL * STILL * num.dot(column, column):
+            return True
+        found.append(rest / np.sqrt(size))
+    return False
 
 
 def grouped(O: Array, Y: Array, there: Array, norm: int) -> Windows:
