@@ -45,6 +45,7 @@ from tailgate.estimators.sparse_attacks.window import (
 
 SMALLEST = 1e-9  # residual [unit of the rows]
 STILL = 1e-9  # a step whose effect on all rows is this small ends the iteration [unit of the rows]
+DEPENDENT = 1e-9  # the part of a column that is left without those before it, where it counts as a combination of them
 FALL = 0.7  # of the least residual that counts, a round
 Rounds = Annotated[int, Field(ge=1, le=100_000)]
 
@@ -99,7 +100,7 @@ def dependent(O: Array) -> bool:
         for one in found:
             rest = rest - num.dot(one, rest) * one
         size = num.dot(rest, rest)
-        if size <= STILL * STILL * num.dot(column, column):
+        if size <= DEPENDENT * DEPENDENT * num.dot(column, column):
             return True
         found.append(rest / np.sqrt(size))
     return False
