@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,14 +19,15 @@ if TYPE_CHECKING:
     from tailgate.training.train import TrainConfig
 
 
+LONGEST = 140  # characters of a default in --help
+
+
 def add(commands: Commands) -> None:
     """Add `train` to the commands."""
-    from tailgate.training.train import parameters
-
-    fields = "\n".join(f"  {p['name']:<18} {p['doc']} (default: {json.dumps(p['default'])})" for p in parameters())
+    fields = "\n".join(_keys())
     command = commands.add_parser(
         "train", help="train an adversary, compare it with scripted attacks on fresh seeds, write a page",
-        description="Train an adversary. Without --config, the preset `quickstart`, which sets some of the fields below.",
+        description="Train an adversary. Without --config, the preset `quickstart`: its values are the defaults below.",
         epilog=f"keys (dotted below environment, threat and the learners, for example ppo.epochs=4):\n{fields}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
@@ -34,6 +36,23 @@ def add(commands: Commands) -> None:
     command.add_argument("--resume", action="store_true", help="continue, with the run's own configuration; steps may change")
     add_options(command, "--json", "overrides")
     command.set_defaults(run=_train, kept="what was finished is kept")
+
+
+def _keys() -> Iterator[str]:
+    """Yield a line for each field: the value of a bare `tailgate train`, and the one of a preset that leaves the field out."""
+    from tailgate.training.train import bare, parameters
+
+    preset = bare()
+    for field in parameters():
+        used = preset.get(field["name"], field["default"])
+        other = "" if used == field["default"] else f"; in a preset that leaves it out: {_brief(field['default'])}"
+        yield f"  {field['name']:<18} {field['doc']} (default: {_brief(used)}{other})"
+
+
+def _brief(value: object) -> str:
+    """Return a value as JSON; that of a long list or mapping is cut."""
+    text = json.dumps(value)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
 
 
 def _train(options: argparse.Namespace) -> int:

@@ -35,6 +35,7 @@ from tailgate.play.metrics import METRICS
 from tailgate.training.settings import check_mappings, check_name, mapping, parameters_of, started_with
 from tailgate.training.trainings import Training, train_all
 
+BARE = "quickstart"  # the preset where none is named
 ENVIRONMENT = (fields_of(ActionSpec) | fields_of(Reward) | {"frames": None}).keys() - {"gamma"}  # that `environment` may hold
 # fields that change no policy; those of CHOSEN do where the best rival teaches
 COMPARED = {"episodes", "first_episode", "white_box", "others", "workers", "device"}
@@ -93,7 +94,7 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
 
     With `resume` the configuration that the run of this name was started with takes the preset's place.
     """
-    config = checked(override(_preset(source or "quickstart"), overrides, TrainConfig))
+    config = checked(override(_preset(source or BARE), overrides, TrainConfig))
     held = _told(config)
     if not resume:
         return config
@@ -374,3 +375,8 @@ def figures(progress: Progress) -> str:
 
 
 parameters = partial(parameters_of, TrainConfig)
+
+
+def bare() -> dict[str, Any]:
+    """Return the fields that the preset of a bare `tailgate train` sets; the others have their defaults."""
+    return _preset(BARE)
