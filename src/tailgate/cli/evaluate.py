@@ -27,7 +27,10 @@ def add(commands: Commands) -> None:
         description="Play a suite, or the part of it that the options name. NAME: a registered component, NAME:key=value,key=value, "
         "module:Class, or (attacks) the JSON file of an exported policy or the YAML file of a program.",
     )  # fmt: skip
-    add_options(command, "--suite", "--defence", "--attack", "--scenario", "--dose", "--threat")
+    add_options(command, "--suite", "--defence", "--attack")
+    command.add_argument("--scenario", action="append", metavar="NAME",
+                         help="a scenario (repeatable); alone: with its own threat model, with --suite: with the suite's")  # fmt: skip
+    add_options(command, "--dose", "--threat")
     command.add_argument("--seeds", type=int, metavar="N", help="episodes per cell instead of the suite's")
     add_options(command, "--purpose")
     command.add_argument("--batch", type=int, default=256, metavar="N", help="episodes side by side (default 256); changes no result")
