@@ -44,6 +44,8 @@ def test_list_shows_every_component_with_its_parameters(capsys: pytest.CaptureFi
     (["leaderboard", "head", "board.json", "--nothing"], "tailgate leaderboard head: error: unrecognized arguments: --nothing"),
     (["train", "--nothing"], "tailgate train: error: unrecognized arguments: --nothing"),
     (["train", "--a\nb"], "tailgate train: error: unrecognized arguments: --a b"),
+    (["evaluate", "--defense", "kf"], "tailgate evaluate: error: unrecognized arguments: --defense kf; did you mean --defence?"),
+    (["detect-log", "x.csv", "--defense=kf"], "tailgate detect-log: error: the following arguments are required: --defence; did you mean --defence?"),
     (["leaderboard", "run"], "tailgate leaderboard run: error: the following arguments are required: SUITE, --out"),
 ])  # fmt: skip
 def test_wrong_arguments_are_answered_in_a_line_by_the_command_that_was_asked(
@@ -53,6 +55,29 @@ def test_wrong_arguments_are_answered_in_a_line_by_the_command_that_was_asked(
         cli.main(arguments)
     said = capsys.readouterr().err
     assert said == f"{words} (see {words.partition(':')[0]} --help)\n"
+
+
+@pytest.mark.parametrize(("arguments", "near"), [(["atack", "kf"], "attack"), (["leaderboard", "tri", "kf"], "try"), (["list", "defenses"], "defences")])
+def test_a_wrong_word_is_answered_with_the_nearest(arguments: list[str], near: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(arguments)
+    assert f"; did you mean {near}? (see tailgate " in capsys.readouterr().err
+
+
+def test_a_packed_board_is_named_where_a_plain_one_is_asked_for(run: Run) -> None:
+    Path("board.json.xz").touch()
+    code, _, errors = run("leaderboard", "page", "board.json", "--out", "page")
+    assert code == 2 and "(No such file or directory); board.json.xz is there" in errors and not Path("page").exists()
+
+
+@pytest.mark.parametrize(("override", "words"), [
+    ("learning_rate=0.1", "expected the field with its place: ppo.learning_rate or "), ("budget=3", "the field with its place: threat.budget"),
+    ("delay=3", "the field with its place: environment.delay"), ("stepps=3", "did you mean 'steps'?"),
+])  # fmt: skip
+def test_a_field_of_another_place_is_named_with_it(override: str, words: str, run: Run) -> None:
+    pytest.importorskip("stable_baselines3")
+    code, _, errors = run("train", "learner=ppo", override)
+    assert code == 2 and words in errors and not list(Path().iterdir())
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
