@@ -4,6 +4,7 @@ import dataclasses
 import importlib
 import json
 import pickle
+import pydoc
 import subprocess
 import sys
 import textwrap
@@ -364,3 +365,13 @@ for family in registry._MODULES:
         assert registry.entries(family), family
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_help_of_the_package_lists_what_is_imported_on_first_use():
+    """Its example plays."""
+    text = pydoc.plain(pydoc.render_doc(tailgate))
+    functions = text[text.index("\nFUNCTIONS") :]
+    assert all(f"\n    {name}(" in functions for name in ("evaluate", "make_defence", "list_attacks", "per_episode"))
+    held: dict = {}
+    exec(textwrap.dedent(tailgate.__doc__.partition("Example::")[2]), held)
+    assert held["env"].spec.id == "tailgate/CarFollowing-v1" and len(held["rows"]) == 2

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tailgate.base.files import aside, writable_directory
-from tailgate.cli.shared import Commands, add_options, counted, own_classes, show, table, tell, threat_of, working
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, tell, threat_of, working
 from tailgate.core.schema import scalar
 
 if TYPE_CHECKING:
@@ -66,6 +66,10 @@ def _evaluate(options: argparse.Namespace) -> int:
         tell(f"{options.out} held something else than these rows; it is in {earlier}")
     table = summarise(rows)
     show(options, table, _print_summary)
+    own = options.suite is None and options.scenario and doses is None and "budget" not in threat
+    if own and not options.json and any(row["attack"] != "none" for row in rows):
+        lasting = " (unlimited: attacks may last the whole episode)" if any(entry["dose"] is None for entry in table) else ""
+        say(f"no --dose: the scenario's own budget{lasting}")
     if options.plot:
         from tailgate.base.plots import write_overview
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
+from tailgate.base.errors import InputError
 from tailgate.base.locks import alone
 from tailgate.base.progress import cells, progress
-from tailgate.cli.shared import Commands, add_options, own_classes, print_json, say, table
+from tailgate.cli.shared import Commands, add_options, own_classes, print_json, say, table, tell
 
 if TYPE_CHECKING:
     from tailgate.agents.learners.learning import Progress
@@ -95,8 +97,23 @@ def _train(options: argparse.Namespace) -> int:
         print_json(report | {"page": str(page)})
     else:
         _print_report(report)
+    if report["advantage"]["no attack"]["value"] <= 0.0:
+        tell(_harmless(config, max(report["decisions"])))
     errors.print(f"policy: {', '.join(str(p) for p in policies)}\npage:   {page}")
     return 0
+
+
+def _harmless(config: TrainConfig, decisions: int) -> str:
+    """Return what may be tried where no policy did any damage."""
+    from tailgate.training import train
+
+    who = "this policy" if config.seeds == 1 else "these policies"
+    text = f"{who} did no damage: try more steps than {decisions:,}"
+    try:
+        train.check(dataclasses.replace(config, teacher="best"))
+    except InputError:
+        return text
+    return text if config.teacher else f"{text}, or teacher=best"
 
 
 def _print_report(report: dict[str, Any]) -> None:
@@ -114,7 +131,7 @@ def _print_report(report: dict[str, Any]) -> None:
     for name, why in report["left_out"].items():
         say(f"left out: {name} ({why})")
     for name, gain in report["advantage"].items():
-        verdict = "wins" if gain["low"] > 0 else "loses" if gain["high"] < 0 else "undecided"
+        verdict = "wins" if gain["low"] > 0 else "loses" if gain["high"] < 0 else "equal" if gain["value"] == 0 else "undecided"
         scale, points = (100.0, " points") if report["unit"] == SHARE else (1.0, "")
         value, low, high = (f"{scale * gain[key]:+.{1 if points else 3}f}" for key in ("value", "low", "high"))
         say(f"learned against {name}: {value}{points}, 95 % interval {low} to {high} ({verdict})")
