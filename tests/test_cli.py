@@ -2,14 +2,18 @@
 
 import importlib
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tailgate import cli
+from tailgate.cli.train import _harmless, _print_report
+from tailgate.training.train import load_config
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -38,12 +42,21 @@ def test_list_shows_every_component_with_its_parameters(capsys: pytest.CaptureFi
     assert cli.main(["list", "defences"]) == 0
     table = capsys.readouterr().out
     assert "chi2_kf" in table and "stealth" not in table
+    assert cli.main(["list"]) == 0
+    counts = capsys.readouterr().out
+    assert re.search(rf"defences\W+{len(cards['defences'])}\W+tailgate list defences", counts) and "tailgate list --all" in counts
+    assert all(f"tailgate list {group}" in counts for group in cards) and len(counts.splitlines()) < 20
+    assert cli.main(["list", "--all"]) == 0
+    everything = capsys.readouterr().out
+    assert "chi2_kf" in everything and "stealth" in everything and "quick-v0" in everything
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
     (["leaderboard", "head", "board.json", "--nothing"], "tailgate leaderboard head: error: unrecognized arguments: --nothing"),
     (["train", "--nothing"], "tailgate train: error: unrecognized arguments: --nothing"),
     (["train", "--a\nb"], "tailgate train: error: unrecognized arguments: --a b"),
+    (["evaluate", "--defense", "kf"], "tailgate evaluate: error: unrecognized arguments: --defense kf; did you mean --defence?"),
+    (["detect-log", "x.csv", "--defense=kf"], "tailgate detect-log: error: the following arguments are required: --defence; did you mean --defence?"),
     (["leaderboard", "run"], "tailgate leaderboard run: error: the following arguments are required: SUITE, --out"),
 ])  # fmt: skip
 def test_wrong_arguments_are_answered_in_a_line_by_the_command_that_was_asked(
@@ -53,6 +66,29 @@ def test_wrong_arguments_are_answered_in_a_line_by_the_command_that_was_asked(
         cli.main(arguments)
     said = capsys.readouterr().err
     assert said == f"{words} (see {words.partition(':')[0]} --help)\n"
+
+
+@pytest.mark.parametrize(("arguments", "near"), [(["atack", "kf"], "attack"), (["leaderboard", "tri", "kf"], "try"), (["list", "defenses"], "defences")])
+def test_a_wrong_word_is_answered_with_the_nearest(arguments: list[str], near: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(arguments)
+    assert f"; did you mean {near}? (see tailgate " in capsys.readouterr().err
+
+
+def test_a_packed_board_is_named_where_a_plain_one_is_asked_for(run: Run) -> None:
+    Path("board.json.xz").touch()
+    code, _, errors = run("leaderboard", "page", "board.json", "--out", "page")
+    assert code == 2 and "(No such file or directory); board.json.xz is there" in errors and not Path("page").exists()
+
+
+@pytest.mark.parametrize(("override", "words"), [
+    ("learning_rate=0.1", "expected the field with its place: ppo.learning_rate or "), ("budget=3", "the field with its place: threat.budget"),
+    ("delay=3", "the field with its place: environment.delay"), ("stepps=3", "did you mean 'steps'?"),
+])  # fmt: skip
+def test_a_field_of_another_place_is_named_with_it(override: str, words: str, run: Run) -> None:
+    pytest.importorskip("stable_baselines3")
+    code, _, errors = run("train", "learner=ppo", override)
+    assert code == 2 and words in errors and not list(Path().iterdir())
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
@@ -101,6 +137,35 @@ def test_evaluate_prints_a_table_or_json_and_writes_rows(tmp_path: Path, capsys:
     assert json.loads(capsys.readouterr().out)[0]["dose"] is None
     assert cli.main(["leaderboard", "build", "--rows", "rows.jsonl", "--out", "page"]) == 0
     assert (tmp_path / "page" / "index.html").is_file()
+
+
+@pytest.mark.parametrize(("more", "words"), [
+    ([], "no --dose: the scenario's own budget (unlimited: attacks may last the whole episode)"), (["--dose", "4"], None), (["--suite", "quick-v0"], None),
+    (["--threat", "budget=4"], None), (["--json"], None),
+])  # fmt: skip
+def test_without_a_dose_the_budget_is_explained(more: list[str], words: str | None, run: Run) -> None:
+    code, out, _ = run("evaluate", "--scenario", "braking-v0", "--defence", "kf", "--attack", "fdi", "--seeds", "1", *more)
+    assert code == 0 and (words in " ".join(out.split()) if words else "no --dose" not in out)
+
+
+REPORT: dict[str, Any] = {"threat": {"budget": 4}, "outcome": "crashed", "unit": "0/1", "attacks": [], "episodes": 400, "defence": "kf", "scenario": "s", "left_out": {}}
+
+
+@pytest.mark.parametrize(("gain", "words"), [
+    ((0.0, -0.01, 0.01), "+0.0 points, 95 % interval -1.0 to +1.0 (equal)"), ((0.01, -0.01, 0.03), "(undecided)"), ((0.5, 0.4, 0.6), "(wins)"),
+    ((-0.5, -0.6, -0.4), "(loses)"),
+])  # fmt: skip
+def test_a_verdict_on_a_policy(gain: tuple[float, float, float], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    _print_report(REPORT | {"advantage": {"fdi": dict(zip(("value", "low", "high"), gain, strict=True))}})
+    assert words in capsys.readouterr().out
+
+
+def test_a_policy_that_did_no_damage_is_said_what_to_try(tmp_path: Path) -> None:
+    """A teacher where the learner can be shown something, and has none."""
+    config, out = load_config(None, [f"out={tmp_path}"]), f"out={tmp_path}"
+    assert _harmless(config, 1500) == "this policy did no damage: try more steps than 1,500, or teacher=best"
+    assert _harmless(load_config(None, ["rivals=[]", "seeds=2", out]), 7) == "these policies did no damage: try more steps than 7"
+    assert _harmless(load_config(None, ["teacher=best", out]), 7) == "this policy did no damage: try more steps than 7"
 
 
 DEPENDENT = """

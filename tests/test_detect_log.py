@@ -131,6 +131,7 @@ def test_the_command(tmp_path, capsys):
     (["asta-braking", "--defence", "kf", "--window", "1"], "--window: got 1.0"), (["asta-braking", "--defence", "kf", "--range-sd", "0"], "--range-sd: got 0.0"),
     (["asta-braking", "--defence", "kf", "--hours", "-1"], "--hours: got -1.0"), (["asta-braking", "--defence", "kf", "--threat", "fdi"], "--threat"),
     (["asta-braking", "--defence", "kf", "--threat", "fdi_bound=-1"], "threat_model.fdi_bound"), (["asta-braking", "--defence", "kf", "--map", "x=y"], "--map"),
+    (["asta-braking", "--defence", "kf", "--plot", "dl"], "--plot: got 'dl'; expected a file name that ends in .png"),
 ])  # fmt: skip
 def test_bad_input_is_refused(arguments, words, capsys):
     assert main(["detect-log", *arguments]) == 2
@@ -152,6 +153,15 @@ def test_a_file_and_the_trace_of_the_package_agree(tmp_path):
     path.write_text(logs.table(**{names[key]: value for key, value in held.items()}), encoding="utf-8")
     for mine, theirs in zip(read(str(path)), read("asta-braking"), strict=True):
         assert np.array_equal(mine.segments[0].gap, theirs.segments[0].gap)
+
+
+def test_a_recording_without_a_name_has_that_of_its_file(tmp_path, capsys):
+    t = np.arange(200) * 0.1
+    path = tmp_path / "drive.csv"
+    path.write_text("t,gap,speed,relative_speed\n" + "".join(f"{x:.1f},{30 + np.sin(x):.4f},20.0,{np.cos(x):.4f}\n" for x in t))
+    columns = [word for name in ("t", "gap", "speed", "relative_speed") for word in ("--map", f"{name}={name}")]
+    assert main(["detect-log", str(path), "--defence", "kf", *columns]) == 0
+    assert "drive.csv" in capsys.readouterr().out
 
 
 def test_replays_are_written(tmp_path):

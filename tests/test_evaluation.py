@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import pickle
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -136,6 +137,16 @@ def test_a_defence_that_kills_its_process_costs_its_own_rows_only(tmp_path: Path
 def test_a_pairing_without_meaning_is_skipped_with_the_reason() -> None:
     rows = tailgate.evaluate(scenarios=[PLACE], defences=["none"], attacks=["stealth"], seeds=2)
     assert {row["status"] for row in rows} == {"skipped"} and "look" in rows[0]["reason"]
+
+
+def test_a_single_name_is_a_list_of_one() -> None:
+    """And a keyword that is nearly one of the function's is named."""
+    part: dict[str, Any] = {"seeds": 2, "threat": {"budget": 3}}
+    rows = tailgate.evaluate(scenarios="braking-v0", defences="kf", attacks="none", doses=4, **part)
+    assert rows == tailgate.evaluate(scenarios=["braking-v0"], defences=["kf"], attacks=["none"], doses=[4], **part) and len(rows) == 2
+    with pytest.raises(InputError, match=r"argument of evaluate: got 'defence'; expected one of these \(did you mean 'defences'\?\)") as caught:
+        tailgate.evaluate(scenarios="braking-v0", defence="kf")  # type: ignore[call-arg]
+    assert isinstance(caught.value, TypeError) and str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
 
 
 def test_objects_keep_their_card() -> None:

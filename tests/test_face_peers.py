@@ -27,6 +27,12 @@ def test_an_unknown_argument_is_both_errors():
         assert str(again) == str(caught.value) and isinstance(again, UnknownArgument)
 
 
+def test_a_field_of_the_threat_model_is_named_with_its_place():
+    with pytest.raises(InputError, match=r"got 'budget'; expected threat=\{'budget': 3\}, or one of .*\(unexpected keyword argument 'budget'\)") as caught:
+        AdversaryEnv(budget=3)
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+
+
 def test_the_autoreset_mode_is_an_attribute_and_an_argument():
     """By the name, or as Gymnasium's own."""
     for mode in AutoresetMode:

@@ -3,6 +3,8 @@
 import dataclasses
 import hashlib
 import json
+import re
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from tailgate.base.errors import InputError
 from tailgate.core import draws
 from tailgate.core.neural import Network
 from tailgate.core.registry import Spec
-from tailgate.core.scenario import Scenario, load_scenario
+from tailgate.core.scenario import Scenario, load_scenario, load_suite
 from tailgate.envs.gym.actions import ActionCodec, ActionSpec
 from tailgate.envs.gym.gymnasium_env import AdversaryVectorEnv
 from tailgate.envs.gym.observations import ObservationCodec
@@ -304,3 +306,17 @@ def test_a_policy_that_does_not_fit_names_the_options_of_its_training(tmp_path: 
         for brief in (fewer, _place("white").brief()):
             with pytest.raises(InputError, match=words):
                 PolicyAttack(path).prepare(brief)
+
+
+def test_a_policy_outside_of_the_threat_model_names_itself_and_the_remedy() -> None:
+    """The options that grant what it was trained with, and the suites that do; with them it plays."""
+    policy = PolicyAttack(Path(str(files("tailgate.agents.policies").joinpath("radar-following-kf-0.json"))))
+    place = load_scenario("radar-following-v0").with_threat(delay_bound=20.0)
+    words = (
+        "policy radar-following-kf-0.json: delay: got 60.0; expected at most the threat model's delay_bound (20.0); it was trained with "
+        "--scenario radar-following-v0 --threat budget=4; add --threat delay_bound=60.0, or --suite radar-v0 or --suite radar-v1"
+    )
+    with pytest.raises(InputError, match=f"^{re.escape(words)}$"):
+        policy.prepare(place.brief())
+    for granted in (place.with_threat(delay_bound=60.0), place.with_threat(**load_suite("radar-v0").granted)):
+        assert policy.prepare(granted.brief()).action.spec.delay == 60.0

@@ -1,14 +1,17 @@
 """Presets of train.py and their outcomes."""
 
 import dataclasses
+import json
+import re
 from pathlib import Path
 
 import pytest
 
+from tailgate import cli
 from tailgate.agents.learners.cem import Config as CemConfig
 from tailgate.agents.learners.ppo import Config
 from tailgate.base.errors import InputError
-from tailgate.core.schema import build
+from tailgate.core.schema import as_data, build
 from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.evaluation.baselines import outcomes
 from tailgate.training import train
@@ -59,3 +62,16 @@ def test_an_outcome_is_a_metric_that_every_episode_has(tmp_path: Path) -> None:
     row = {"status": "ok", "attack": "fdi", "recovery_time": None}
     with pytest.raises(InputError, match="recovery_time"):
         outcomes([row], "recovery_time")
+
+
+def test_the_help_of_train_shows_what_a_bare_train_uses(capsys: pytest.CaptureFixture[str]) -> None:
+    """And the value of a preset that leaves the field out, where it is another."""
+    with pytest.raises(SystemExit, match="0"):
+        cli.main(["train", "--help"])
+    shown = dict(re.findall(r"(?m)^  ([a-z_]+) +.*\(default: (.*)\)$", capsys.readouterr().out))
+    used, blank = ({f.name: as_data(getattr(c, f.name)) for f in dataclasses.fields(c)} for c in (train.load_config(None, []), train.TrainConfig()))
+    for name, text in shown.items():
+        value, _, other = text.partition("; in a preset that leaves it out: ")
+        assert value.endswith("...") or json.loads(value) == used[name]
+        assert json.loads(other) == blank[name] != used[name] if other else used[name] == blank[name]
+    assert shown.keys() == {f.name for f in dataclasses.fields(train.TrainConfig)} and shown["steps"].startswith("40000000; ")

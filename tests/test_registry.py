@@ -4,6 +4,7 @@ import dataclasses
 import importlib
 import json
 import pickle
+import pydoc
 import subprocess
 import sys
 import textwrap
@@ -95,10 +96,28 @@ BAD = [
     ("defence", "chi2_kf:eta=big", r"chi2_kf\.eta: got 'big'; expected"), ("defence", "chi2_kf:eta=-1", r"chi2_kf\.eta: got -1"),
     ("defence", "chi2_kf:eta=nan", r"chi2_kf\.eta: got nan"), ("defence", "chi2_kf:eta=3,4", r"name:key=value,key=value"),
     ("defence", "no_such_module:Thing", r"importable module"), ("defence", "tailgate.estimators:Nothing", r"a class that module"),
+    ("defence", "their_defence:Mien", r"a class that module their_defence defines \(did you mean 'Mine'\?\): Mine$"),
+    ("defence", "Mine", r"'Mine'; expected a class of yours as module:Mine, or one of"), ("attack", "Creep", r"a class of yours as module:Creep"),
     ("defence", "their_defence:NUMBER", r"expected a class"), ("defence", "their_defence:Mine:gain=x", r"gain: got 'x'"),
     ("defence", ":Mine", r"defence: got ':Mine'"), ("defence", ".estimators:Kalman", r"defence: got '\.estimators:Kalman'"),
     ("attack", "nowhere.json:speed=1", r"unknown field: got 'speed'"),
 ]  # fmt: skip
+
+
+def test_a_module_that_is_not_there_is_looked_for_in_the_working_directory(tmp_path, monkeypatch):
+    """The error names the folder, and a file there whose name is nearly the same."""
+    (tmp_path / "mydefence.py").touch()
+    monkeypatch.chdir(tmp_path)
+    for there, words in (("", rf"working directory {tmp_path} and the installed packages \(did you mean 'mydefence'\?\)$"), (None, r"looked for in the installed packages$")):
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "path", [path for path in sys.path if path and Path(path).resolve() != tmp_path] + ([there] if there is not None else []))
+            with pytest.raises(InputError, match=words):
+                Spec("defence", "mydefense:Mine").make()
+
+
+def test_a_plant_of_a_file_is_registered_in_python():
+    with pytest.raises(InputError, match=r"a name that @register\('plant', NAME\) of tailgate.core.registry .* before it is used: a file imports"):
+        make_from("plant", "myplant:Mine", "scenario s.plant")
 
 
 @pytest.mark.parametrize("family, text, message", BAD)
@@ -346,3 +365,13 @@ for family in registry._MODULES:
         assert registry.entries(family), family
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_help_of_the_package_lists_what_is_imported_on_first_use():
+    """Its example plays."""
+    text = pydoc.plain(pydoc.render_doc(tailgate))
+    functions = text[text.index("\nFUNCTIONS") :]
+    assert all(f"\n    {name}(" in functions for name in ("evaluate", "make_defence", "list_attacks", "per_episode"))
+    held: dict = {}
+    exec(textwrap.dedent(tailgate.__doc__.partition("Example::")[2]), held)
+    assert held["env"].spec.id == "tailgate/CarFollowing-v1" and len(held["rows"]) == 2

@@ -145,6 +145,7 @@ def test_the_command_trains_compares_and_writes_a_page(
     report = json.loads(done.stdout)
     assert set(report["advantage"]) == {"no attack", "own yoked schedule", "best scripted attack"}
     assert report["attacks"][0]["label"] == "no attack"
+    assert ("did no damage" in done.stderr) == (report["advantage"]["no attack"]["value"] <= 0.0)
     run = tmp_path / "runs" / "quickstart"
     rows = [json.loads(line) for line in (run / "rows.jsonl").read_text().splitlines()]
     played = {(row["defence"], row["attack"]) for row in rows}

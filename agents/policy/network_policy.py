@@ -20,6 +20,7 @@ import numpy as np
 from safetensors.numpy import save as save_tensors
 
 from tailgate import num
+from tailgate.agents.policy.granted import remedy
 from tailgate.base.errors import InputError
 from tailgate.base.files import write_atomic
 from tailgate.core import Array, Command, PositiveCount, View, param
@@ -170,7 +171,11 @@ class PolicyAttack:
         if (1 if header.agents is None else header.agents) != agents:
             made = f"a policy for {_count(header.agents or 1)}"
             raise InputError(f"policy {self.path.name}", made, f"one for this scenario's {_count(agents)}")
-        action, observation = ActionCodec(header.action, brief), ObservationCodec(brief, header.frames)
+        try:
+            action, observation = ActionCodec(header.action, brief), ObservationCodec(brief, header.frames)
+        except InputError as error:
+            hint = _trained_with(header) + remedy(header.training, brief.threat)
+            raise InputError(f"policy {self.path.name}: {error.field}", error.value, error.expected + hint) from None
         if observation.names != header.observation:
             differing = sorted(set(header.observation) ^ set(observation.names)) or ["in another order"]
             shown = ", ".join(differing[:SOME]) + (f" and {len(differing) - SOME} more" if len(differing) > SOME else "")

@@ -140,7 +140,8 @@ class Seat:
         known = fields_of(ActionSpec) | fields_of(Reward)
         for key in options:
             if key not in known:
-                raise UnknownArgument(key, [*known, "scenario", "defence", "threat", "knowledge", "frames"])
+                hint = f"threat={{{key!r}: {options[key]!r}}}, or " if key in fields_of(ThreatModel) else ""
+                raise UnknownArgument(key, [*known, "scenario", "defence", "threat", "knowledge", "frames"], hint)
         for key in threat:
             if key not in fields_of(ThreatModel):
                 raise unknown("threat: unknown field", key, fields_of(ThreatModel))

@@ -1,9 +1,14 @@
 """Tailgate: defences for adaptive cruise control, scored against an adversary that learns when to attack.
 
+`evaluate` plays defences against attacks and returns a row per episode; `make_defence`, `make_attack` and the lists give components.
+
 Example::
 
     import gymnasium
-    env = gymnasium.make("tailgate:tailgate/CarFollowing-v0", defence="chi2_kf")
+    env = gymnasium.make("tailgate:tailgate/CarFollowing-v1", defence="chi2_kf")
+
+    import tailgate
+    rows = tailgate.evaluate(scenarios="stop-and-go-v0", defences="chi2_kf", attacks="none", seeds=2)
 """
 
 from typing import Any
@@ -41,6 +46,11 @@ def list_attacks() -> list[str]:
 
 
 __getattr__, _ = exported(__name__, {"estimators": "per_episode", "evaluation.cells": "evaluate", "envs.gym.parallel": "parallel_env"})
+
+
+def __dir__() -> list[str]:
+    """Return the names of the package, with functions that are imported on first use: `help(tailgate)` lists them."""
+    return sorted({*globals(), "evaluate", "per_episode"})
 
 
 def _register() -> None:

@@ -1,8 +1,13 @@
 """The errors that bad input raises."""
 
 import difflib
-from collections.abc import Iterable, Mapping
-from typing import Any
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 class InputError(ValueError):
@@ -30,17 +35,31 @@ class UnknownArgument(InputError, TypeError):
     Gymnasium raises it again as `type(error)(text)`, so the constructor also takes one text.
     """
 
-    def __init__(self, name: str, known: Iterable[str] | None = None) -> None:
-        self.known = None if known is None else sorted(known)
+    def __init__(self, name: str, known: Iterable[str] | None = None, hint: str = "", where: str = "environment argument") -> None:
+        self.known, self.hint, self.where = None if known is None else sorted(known), hint, where
         if self.known is None:
             ValueError.__init__(self, name)
             self.field, self.value, self.expected = "argument", None, ""
             return
-        expected = f"{_among(name, self.known)} (unexpected keyword argument '{name}')"
-        super().__init__("environment argument", name, expected)
+        expected = f"{hint}{_among(name, self.known)} (unexpected keyword argument '{name}')"
+        super().__init__(where, name, expected)
 
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
-        return type(self), (self.args[0],) if self.known is None else (self.value, self.known)
+        return type(self), (self.args[0],) if self.known is None else (self.value, self.known, self.hint, self.where)
+
+
+def known_arguments(function: Callable[P, R]) -> Callable[P, R]:
+    """Return the function with an error for a keyword that it does not know: it suggests the nearest, and lists them all."""
+    known = inspect.signature(function).parameters
+
+    @wraps(function)
+    def call(*args: P.args, **named: P.kwargs) -> R:
+        for name in named:
+            if name not in known:
+                raise UnknownArgument(name, known, where=f"argument of {function.__name__}")
+        return function(*args, **named)
+
+    return call
 
 
 def _cut(text: str, most: int) -> str:

@@ -34,7 +34,9 @@ def read_json(path: Path, where: str, what: str = "JSON file", hint: str = "") -
     try:
         return load_json(path)
     except (OSError, ValueError) as error:
-        raise InputError(where, str(path), f"a readable {what} ({said(error)}){hint}") from None
+        other = path.with_suffix("") if path.suffix == ".xz" else Path(f"{path}.xz")
+        there = f"; {other} is there" if not path.exists() and other.is_file() else ""
+        raise InputError(where, str(path), f"a readable {what} ({said(error)}){there}{hint}") from None
 
 
 def board_in(folder: Path) -> Path:

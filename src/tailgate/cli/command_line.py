@@ -6,6 +6,8 @@ Results go to standard output (tables for people, --json for machines), progress
 from __future__ import annotations
 
 import argparse
+import difflib
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -18,6 +20,7 @@ from tailgate.base.errors import InputError, Killed
 from tailgate.base.interrupts import Ending, orderly
 
 EXIT_INPUT = 2
+CHOICE, OPTION = 0.6, 0.75  # likeness from which a name is suggested; options have their dashes in common
 COMMANDS = (
     "train", "tune", "selfplay", "ensemble", "distil", "evaluate", "timing", "dose", "transfer", "zoo", "calibrate", "learn_envelope",
     "leaderboard", "log", "replay", "detect_log", "fit", "reproduce", "cost", "trust", "falsify", "rare", "bench", "list", "explain",
@@ -80,14 +83,28 @@ def _kept(chosen: argparse.Namespace) -> str:
 class _Parser(argparse.ArgumentParser):
     """Says in one line what is wrong with the arguments, and which --help explains it; argparse shows the whole usage."""
 
+    given: tuple[str, ...] = ()
+
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        self.given = tuple(map(str, sys.argv[1:] if args is None else args))
         found, rest = super().parse_known_args(args, namespace)
         if rest:
             self.error(f"unrecognized arguments: {' '.join(rest)}")
         return found, rest
 
     def error(self, message: str) -> NoReturn:
-        self.exit(EXIT_INPUT, f"{self.prog}: error: {' '.join(message.split())} (see {self.prog} --help)\n")
+        self.exit(EXIT_INPUT, f"{self.prog}: error: {' '.join(message.split())}{self._near(message)} (see {self.prog} --help)\n")
+
+    def _near(self, message: str) -> str:
+        """Return the nearest option of one that this command does not know, or the nearest choice."""
+        if found := re.search(r"invalid choice: '?([^\s']+)'? \(choose from (.*)\)$", message, re.DOTALL):
+            likeness, wrong, names = CHOICE, [found[1]], re.findall(r"[\w-]+", found[2])
+        else:
+            names = [name for name in self._option_string_actions if name.startswith("--")]
+            options = [text.partition("=")[0] for text in self.given if text.startswith("--")]
+            likeness, wrong = OPTION, [text for text in options if not any(name.startswith(text) for name in names)]
+        near = [match for text in wrong for match in difflib.get_close_matches(text[:100], names, n=1, cutoff=likeness)]
+        return f"; did you mean {near[0]}?" if near else ""
 
 
 def _parser() -> argparse.ArgumentParser:

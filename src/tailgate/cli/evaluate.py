@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tailgate.base.files import aside, writable_directory
-from tailgate.cli.shared import Commands, add_options, counted, own_classes, show, table, tell, threat_of, working
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, tell, threat_of, working
 from tailgate.core.schema import scalar
 
 if TYPE_CHECKING:
@@ -27,7 +27,10 @@ def add(commands: Commands) -> None:
         description="Play a suite, or the part of it that the options name. NAME: a registered component, NAME:key=value,key=value, "
         "module:Class, or (attacks) the JSON file of an exported policy or the YAML file of a program.",
     )  # fmt: skip
-    add_options(command, "--suite", "--defence", "--attack", "--scenario", "--dose", "--threat")
+    add_options(command, "--suite", "--defence", "--attack")
+    command.add_argument("--scenario", action="append", metavar="NAME",
+                         help="a scenario (repeatable); alone: with its own threat model, with --suite: with the suite's")  # fmt: skip
+    add_options(command, "--dose", "--threat")
     command.add_argument("--seeds", type=int, metavar="N", help="episodes per cell instead of the suite's")
     add_options(command, "--purpose")
     command.add_argument("--batch", type=int, default=256, metavar="N", help="episodes side by side (default 256); changes no result")
@@ -63,6 +66,10 @@ def _evaluate(options: argparse.Namespace) -> int:
         tell(f"{options.out} held something else than these rows; it is in {earlier}")
     table = summarise(rows)
     show(options, table, _print_summary)
+    own = options.suite is None and options.scenario and doses is None and "budget" not in threat
+    if own and not options.json and any(row["attack"] != "none" for row in rows):
+        lasting = " (unlimited: attacks may last the whole episode)" if any(entry["dose"] is None for entry in table) else ""
+        say(f"no --dose: the scenario's own budget{lasting}")
     if options.plot:
         from tailgate.base.plots import write_overview
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tailgate.base.errors import InputError
-from tailgate.cli.shared import Commands, counted, say, show, table, working
+from tailgate.cli.shared import Commands, counted, picture, say, show, table, working
 
 
 def add(commands: Commands) -> None:
@@ -46,14 +46,15 @@ def _fit(options: argparse.Namespace) -> int:
     from tailgate.base.files import write_atomic
     from tailgate.roads.fit import DELAYS, Settings, draw, fit
 
+    plot = picture("--plot", options.plot) if options.plot else None
     given = {"window": options.window, "delays": tuple(options.delay or DELAYS)}
     settings = Settings(**given) if options.trace is None else Settings(tuple(map(_trace, options.trace)), **given)
     with working() as update:
         held = fit(settings, counted(update, "fitting", "fits"))
     if options.out:
         write_atomic(Path(options.out), json.dumps(held, indent=1).encode() + b"\n")
-    if options.plot:
-        write_atomic(Path(options.plot), draw(held), "plot")
+    if plot is not None:
+        write_atomic(plot, draw(held), "plot")
     show(options, held, _tables)
     return 0
 

@@ -13,6 +13,7 @@ from rich.table import Table
 from tailgate.base.errors import InputError
 from tailgate.base.progress import console
 from tailgate.cli.shared import Commands, print_json
+from tailgate.cli.shared import table as show_table
 
 
 def add(commands: Commands) -> None:
@@ -21,6 +22,7 @@ def add(commands: Commands) -> None:
     command = commands.add_parser("list", help=about)
     groups = ["defences", "filters", "detectors", "mitigations", "attacks", "zoo", "scenarios", "suites", "traces"]
     command.add_argument("what", nargs="?", choices=groups, help="only these; attacks: with the zoo of trained policies")
+    command.add_argument("--all", action="store_true", help="everything, with parameters (default: how many there are of each)")
     command.add_argument("--graph", metavar="SCENARIO", help="draw who hears whom in this scenario instead (needs tailgate[viz])")
     command.add_argument("--out", metavar="FILE", help="the drawing: .png (default: SCENARIO.png), .svg or .pdf")
     command.add_argument("--json", action="store_true", help="print cards with every parameter as JSON")
@@ -55,6 +57,10 @@ def _list(options: argparse.Namespace) -> int:
         print_json(chosen)
         return 0
     out = console()
+    if options.what is None and not options.all:
+        counts = [(name, str(len(group)), f"tailgate list {name}") for name, group in cards.items()]
+        show_table(("what", "how many", "listed by"), counts, caption="tailgate list --all: everything", numbers=(1,))
+        return 0
     for title, group in chosen.items():
         if title == "zoo":
             out.print(_zoo_table(group))

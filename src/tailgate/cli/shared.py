@@ -8,6 +8,7 @@ import secrets
 import sys
 from collections.abc import Callable, Container, Iterable, Sequence
 from contextlib import AbstractContextManager
+from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 from rich.console import Console
@@ -81,6 +82,14 @@ def values(option: str, texts: Iterable[str], example: str = "") -> dict[str, An
 def threat_of(options: argparse.Namespace) -> dict[str, Any]:
     """Return the changes of a threat model that --threat gives."""
     return values("--threat", options.threat, ", for example fdi_bound=10")
+
+
+def picture(option: str, text: str) -> Path:
+    """Return the file of a picture. Raises InputError for another ending than that of what is drawn."""
+    path = Path(text)
+    if path.suffix.lower() != ".png":
+        raise InputError(option, text, "a file name that ends in .png")
+    return path
 
 
 def working() -> AbstractContextManager[Update]:

@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
+from tailgate.base.errors import InputError
 from tailgate.base.locks import alone
 from tailgate.base.progress import cells, progress
-from tailgate.cli.shared import Commands, add_options, own_classes, print_json, say, table
+from tailgate.cli.shared import Commands, add_options, own_classes, print_json, say, table, tell
 
 if TYPE_CHECKING:
     from tailgate.agents.learners.learning import Progress
     from tailgate.training.train import TrainConfig
 
 
+LONGEST = 140  # characters of a default in --help
+
+
 def add(commands: Commands) -> None:
     """Add `train` to the commands."""
-    from tailgate.training.train import parameters
-
-    fields = "\n".join(f"  {p['name']:<18} {p['doc']} (default: {json.dumps(p['default'])})" for p in parameters())
+    fields = "\n".join(_keys())
     command = commands.add_parser(
         "train", help="train an adversary, compare it with scripted attacks on fresh seeds, write a page",
-        description="Train an adversary. Without --config, the preset `quickstart`, which sets some of the fields below.",
+        description="Train an adversary. Without --config, the preset `quickstart`: its values are the defaults below.",
         epilog=f"keys (dotted below environment, threat and the learners, for example ppo.epochs=4):\n{fields}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
@@ -34,6 +38,23 @@ def add(commands: Commands) -> None:
     command.add_argument("--resume", action="store_true", help="continue, with the run's own configuration; steps may change")
     add_options(command, "--json", "overrides")
     command.set_defaults(run=_train, kept="what was finished is kept")
+
+
+def _keys() -> Iterator[str]:
+    """Yield a line for each field: the value of a bare `tailgate train`, and the one of a preset that leaves the field out."""
+    from tailgate.training.train import bare, parameters
+
+    preset = bare()
+    for field in parameters():
+        used = preset.get(field["name"], field["default"])
+        other = "" if used == field["default"] else f"; in a preset that leaves it out: {_brief(field['default'])}"
+        yield f"  {field['name']:<18} {field['doc']} (default: {_brief(used)}{other})"
+
+
+def _brief(value: object) -> str:
+    """Return a value as JSON; that of a long list or mapping is cut."""
+    text = json.dumps(value)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
 
 
 def _train(options: argparse.Namespace) -> int:
@@ -76,8 +97,23 @@ def _train(options: argparse.Namespace) -> int:
         print_json(report | {"page": str(page)})
     else:
         _print_report(report)
+    if report["advantage"]["no attack"]["value"] <= 0.0:
+        tell(_harmless(config, max(report["decisions"])))
     errors.print(f"policy: {', '.join(str(p) for p in policies)}\npage:   {page}")
     return 0
+
+
+def _harmless(config: TrainConfig, decisions: int) -> str:
+    """Return what may be tried where no policy did any damage."""
+    from tailgate.training import train
+
+    who = "this policy" if config.seeds == 1 else "these policies"
+    text = f"{who} did no damage: try more steps than {decisions:,}"
+    try:
+        train.check(dataclasses.replace(config, teacher="best"))
+    except InputError:
+        return text
+    return text if config.teacher else f"{text}, or teacher=best"
 
 
 def _print_report(report: dict[str, Any]) -> None:
@@ -95,7 +131,7 @@ def _print_report(report: dict[str, Any]) -> None:
     for name, why in report["left_out"].items():
         say(f"left out: {name} ({why})")
     for name, gain in report["advantage"].items():
-        verdict = "wins" if gain["low"] > 0 else "loses" if gain["high"] < 0 else "undecided"
+        verdict = "wins" if gain["low"] > 0 else "loses" if gain["high"] < 0 else "equal" if gain["value"] == 0 else "undecided"
         scale, points = (100.0, " points") if report["unit"] == SHARE else (1.0, "")
         value, low, high = (f"{scale * gain[key]:+.{1 if points else 3}f}" for key in ("value", "low", "high"))
         say(f"learned against {name}: {value}{points}, 95 % interval {low} to {high} ({verdict})")

@@ -8,8 +8,6 @@ import hashlib
 import importlib
 import inspect
 import json
-import sys
-import traceback
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,6 +18,8 @@ from typing import Any, Literal, TypedDict, TypeVar, Unpack
 
 from tailgate.base.errors import InputError, unknown
 from tailgate.base.lazy import components, loaded
+from tailgate.core.foreign import class_of, unregistered
+from tailgate.core.foreign import said as said
 from tailgate.core.schema import as_data, build, fields_of, scalar
 from tailgate.core.spec_text import put_in, split_items, split_text
 
@@ -42,6 +42,7 @@ _GROUPS = {"defence": "tailgate.estimators", "attack": "tailgate.agents"}
 SANDBOXES = ("bwrap", "docker")
 _FILES = {".json": "policy", ".yaml": "program", ".yml": "program"}  # attacks that are files
 PARTS: tuple[Family, ...] = ("filter", "detector", "mitigation")  # of the defence `composed`
+IMPORTED: tuple[Family, ...] = ("defence", "attack", *PARTS)  # families of which module:Class may be named
 _entries: dict[str, dict[str, "Entry"]] = {family: {} for family in _MODULES}
 _plugins_loaded: set[str] = set()
 T = TypeVar("T", bound=type)
@@ -193,7 +194,7 @@ def find(family: Family, name: str) -> Entry:
         return found
     known = _load(family)
     if name not in known:
-        raise unknown(family, name, known)
+        raise unregistered(family, name, known, family in IMPORTED)
     return known[name]
 
 
@@ -336,37 +337,12 @@ class Spec:
         return made
 
 
-def said(error: Exception) -> str:
-    """Return an error of somebody's code in a line: its type, its words, and the last line of that code on the way to it.
-
-    Compiled code is left out, as its files cannot be read.
-    """
-    place = ""
-    for frame, line in traceback.walk_tb(error.__traceback__):
-        file, package = frame.f_code.co_filename, str(frame.f_globals.get("__name__", "")).partition(".")[0]
-        if package != "tailgate" and package not in sys.stdlib_module_names and "site-packages" not in file and Path(file).is_file():
-            place = f" ({Path(file).name}, line {line})"
-    return f"{type(error).__name__}: {error}{place}"
-
-
 def imported(family: Family, text: str) -> Entry:
     """Return the entry of a class that the user names as module:Class."""
-    module, _, name = text.partition(":")
+    module = text.partition(":")[0]
     if module in _load(family):
         raise InputError(family, text, f"{module}:key=value,key=value")
-    try:
-        cls = getattr(importlib.import_module(module), name)
-    except (ImportError, ValueError, TypeError) as error:  # also an empty or relative module name
-        raise InputError(family, text, f"an importable module ({error})") from None
-    except AttributeError:
-        raise InputError(family, text, f"a class that module {module} defines") from None
-    except SyntaxError as error:
-        raise InputError(family, text, f"a module without syntax errors ({error.msg}, line {error.lineno})") from None
-    except Exception as error:  # whatever its first lines do
-        raise InputError(family, text, f"a module that can be imported ({said(error)})") from None
-    if not isinstance(cls, type):
-        raise InputError(family, text, "a class")
-    return entry_of(family, text, cls)
+    return entry_of(family, text, class_of(family, text))
 
 
 def _takes(function: Callable[..., Any]) -> float:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from tailgate.base import sizes, sources
-from tailgate.base.errors import InputError, NotApplicable
+from tailgate.base.errors import InputError, NotApplicable, known_arguments
 from tailgate.base.files import write_atomic
 from tailgate.base.pool import apart, each
 from tailgate.base.reading import YAML_ENDS
@@ -252,13 +252,19 @@ def _play(cells: Sequence[Cell], workers: int) -> Generator[tuple[int, list[dict
     )
 
 
+def _several(value: Any) -> list[Any]:
+    """Return a list of the value, which may be a single name, number or object."""
+    return list(value) if isinstance(value, Iterable) and not isinstance(value, str) else [value]
+
+
+@known_arguments
 def evaluate(
     suite: str | Suite | None = None,
     *,
-    defences: Sequence[Any] | None = None,
-    attacks: Sequence[Any] | None = None,
-    scenarios: Sequence[str] | None = None,
-    doses: Sequence[int | None] | None = None,
+    defences: Any | Sequence[Any] | None = None,
+    attacks: Any | Sequence[Any] | None = None,
+    scenarios: str | Sequence[str] | None = None,
+    doses: int | Sequence[int | None] | None = None,
     seeds: int | None = None,
     purpose: str = "report",
     batch: int = 256,
@@ -274,8 +280,8 @@ def evaluate(
     Parameters
     ----------
     suite : name or object; without it, give scenarios, defences and attacks
-    defences, attacks : names or objects
-    scenarios, doses, seeds : replace those of the suite
+    defences, attacks : names or objects, one or a list
+    scenarios, doses : one or a list; with seeds, they replace those of the suite
     threat : changes of the scenarios' threat models
     beacon : the round that the episodes belong to
     batch, workers : episodes played together, and processes; they change no bit
@@ -294,15 +300,14 @@ def evaluate(
                 workers=workers, out=out, threat=threat, beacon=beacon, progress=progress,
             )  # fmt: skip
     base = load_suite(suite) if isinstance(suite, str) else suite if suite is not None else Suite(name="custom")
-    defences = list(base.defences if defences is None else defences)
-    attacks = list(base.attacks if attacks is None else attacks)
+    defences, attacks = _several(base.defences if defences is None else defences), _several(base.attacks if attacks is None else attacks)
     sizes.check("batch", batch)
     sizes.check("workers", workers)
     sizes.check("seeds", base.seeds if seeds is None else seeds)
     named = dataclasses.replace(
         base,
-        scenarios=tuple(base.scenarios if scenarios is None else scenarios),
-        doses=tuple(base.doses if doses is None else doses),
+        scenarios=tuple(_several(base.scenarios if scenarios is None else scenarios)),
+        doses=tuple(_several(base.doses if doses is None else doses)),
         defences=tuple(d for d in defences if isinstance(d, str)),
         attacks=tuple(a for a in attacks if isinstance(a, str)),
         seeds=base.seeds if seeds is None else seeds,

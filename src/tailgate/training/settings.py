@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,14 @@ def check_mappings(data: Mapping[str, object], names: Iterable[str]) -> None:
     for name in names:
         if not isinstance(data.get(name, {}), dict):
             raise InputError(f"config.{name}", data[name], "a mapping of fields")
+
+
+def check_places(data: Iterable[str], known: Container[str], places: Mapping[str, Iterable[str]]) -> None:
+    """Raise InputError for a field that belongs below another one: `places` has the fields below each."""
+    for key in data:
+        found = [f"{place}.{key}" for place, fields in places.items() if key in fields]
+        if key not in known and found:
+            raise InputError("config: unknown field", key, f"the field with its place: {' or '.join(found)}")
 
 
 def check_name(name: str) -> None:

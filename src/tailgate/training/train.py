@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ from tailgate.core import Count, Discount, PositiveCount, param
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, config_path, load_scenario
 from tailgate.core.schema import as_data, build, canonical, fields_of, override, read_yaml
-from tailgate.core.threat import KNOWLEDGE
+from tailgate.core.threat import KNOWLEDGE, ThreatModel
 from tailgate.engine import cards
 from tailgate.envs.gym.actions import ActionSpec
 from tailgate.envs.gym.attacker_mdp import Seat
@@ -32,9 +32,10 @@ from tailgate.envs.gym.rewards import Reward
 from tailgate.evaluation.baselines import best_of
 from tailgate.evaluation.cells import cells_of
 from tailgate.play.metrics import METRICS
-from tailgate.training.settings import check_mappings, check_name, mapping, parameters_of, started_with
+from tailgate.training.settings import check_mappings, check_name, check_places, mapping, parameters_of, started_with
 from tailgate.training.trainings import Training, train_all
 
+BARE = "quickstart"  # the preset where none is named
 ENVIRONMENT = (fields_of(ActionSpec) | fields_of(Reward) | {"frames": None}).keys() - {"gamma"}  # that `environment` may hold
 # fields that change no policy; those of CHOSEN do where the best rival teaches
 COMPARED = {"episodes", "first_episode", "white_box", "others", "workers", "device"}
@@ -93,7 +94,7 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
 
     With `resume` the configuration that the run of this name was started with takes the preset's place.
     """
-    config = checked(override(_preset(source or "quickstart"), overrides, TrainConfig))
+    config = checked(override(_preset(source or BARE), overrides, TrainConfig))
     held = _told(config)
     if not resume:
         return config
@@ -121,6 +122,8 @@ def checked(data: dict[str, Any]) -> TrainConfig:
     if others := {name: data[name] for name in data if name in LEARNERS and name not in fields_of(TrainConfig)}:
         data = {key: value for key, value in data.items() if key not in others}
         data["settings"] = data.get("settings", {}) | others
+    if not data.keys() <= fields_of(TrainConfig).keys():
+        check_places(data, fields_of(TrainConfig), _places(data.get("learner")))
     config = build(TrainConfig, data, "config")
     check_name(config.name)
     if config.device is not None:
@@ -135,6 +138,15 @@ def checked(data: dict[str, Any]) -> TrainConfig:
     if shown:
         _ = Spec("attack", shown[0]).entry  # a name that exists
     return config
+
+
+def _places(learner: object) -> dict[str, Iterable[str]]:
+    """Return the fields below each field: those of the learner in use, then those of the other ones that are installed."""
+    places: dict[str, Iterable[str]] = {}
+    for name in sorted(LEARNERS, key=lambda name: name != learner):
+        with contextlib.suppress(ImportError):
+            places[name] = fields_of(learner_of(name).Config)
+    return places | {"environment": ENVIRONMENT, "threat": fields_of(ThreatModel)}
 
 
 def environment_of(config: TrainConfig) -> dict[str, Any]:
@@ -374,3 +386,8 @@ def figures(progress: Progress) -> str:
 
 
 parameters = partial(parameters_of, TrainConfig)
+
+
+def bare() -> dict[str, Any]:
+    """Return the fields that the preset of a bare `tailgate train` sets; the others have their defaults."""
+    return _preset(BARE)
