@@ -54,6 +54,7 @@ COMMANDS = {
     Kind.REPLAY: ("ATTACK: replay", "plays the last readings again, window in steps: "),
     Kind.NOISE_JAM: ("ATTACK: noise jamming", "over the air: noise of "),
     Kind.ECHO_DELAY: ("ATTACK: late echo", "over the air: the probe's answer comes back from farther away, by "),
+    Kind.INSIDER: ("ATTACK: insider", "the car's own law, its gains times "),
 }
 metres = "{:,.1f} m".format
 

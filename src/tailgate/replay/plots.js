@@ -6,11 +6,12 @@ const buildPlots = (() => {
   // by number of the kind: colour and pattern, so that each alone suffices
   const LOOKS = {
     1: ["#b34700", "cross"], 2: ["#0072b2", "across"], 3: ["#00694b", "dashes"], 4: ["#4d4d4d", "dots"], 5: ["#7a2a6b", "rising"],
-    6: ["#8a5a00", "falling"], 7: ["#1a1a1a", "upright"], 8: ["#a3003c", "specks"], 9: ["#00606b", "waves"],
+    6: ["#8a5a00", "falling"], 7: ["#1a1a1a", "upright"], 8: ["#a3003c", "specks"], 9: ["#00606b", "waves"], 10: ["#4b2e83", "corners"],
   };
   const PATTERNS = {
     cross: "M0 0 8 8M8 0 0 8", across: "M0 2H8M0 6H8", dashes: "M0 2H5M4 6H8M0 6H1", dots: "M1 2h2M5 6h2", rising: "M-2 2 2-2M0 8 8 0M6 10 10 6",
     falling: "M-2 6 2 10M0 0 8 8M6-2 10 2", upright: "M2 0V8M6 0V8", specks: "M1 1h1M5 2h1M3 4h1M7 5h1M1 6h1M5 7h1", waves: "M0 4 2 1 4 4 6 7 8 4",
+    corners: "M1 3V1H3M5 7H7V5",
   };
 
   const make = (name, attributes = {}, parent = null, words = null) => {
