@@ -66,6 +66,7 @@ def test_episodes_begin_again(host_card: HostCard) -> None:
     assert (after > before).all() and flight._state.state.get_leaf("loop.k").max() <= flight.programs.loop.horizon
 
 
+@pytest.mark.long
 def test_golden_traces_on_the_card(host_card: HostCard) -> None:
     """One scenario of the published suites; the others take minutes."""
     assert golden.main(["--check", "--scenario", "stop-and-go-v0", "--device", "cuda"]) == 0 and host_card.launches > 0

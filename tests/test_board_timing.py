@@ -208,7 +208,7 @@ def test_published_timings_are_of_their_boards(path: Path) -> None:
         assert gain.value == pytest.approx((gain.only_own - gain.only_yoked) / entry.episodes) and gain.low <= gain.value <= gain.high
 
 
-@pytest.mark.thin(2)
+@pytest.mark.long
 @pytest.mark.parametrize(("suite", "defence"), [("radar-v0", "chi2_kf_sparse"), ("thesis-v0", "cra:probability=0.3,quiet=5")])
 def test_a_published_timing_comes_out_again(suite: str, defence: str) -> None:
     path = ROOT / f"results/{suite}/board.json"

@@ -56,6 +56,7 @@ def board(detected: Data) -> Data:
     return copy.deepcopy(detected)
 
 
+@pytest.mark.long
 def test_a_board_without_rows_gets_its_detection(bare: Data, detected: Data) -> None:
     """All else stays; a plain filter is watched, and a looser threshold lets more through."""
     read_board(detected)

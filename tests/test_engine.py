@@ -141,6 +141,7 @@ def as_numpy(program: Program, uniforms: list[Node], shapes: dict[str, Any], bat
         state = held_state
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("seed", range(24))
 def test_random_graphs(seed: int) -> None:
     trace, uniforms, shapes = random_trace(seed)

@@ -97,6 +97,7 @@ def test_no_invariant_bounds_a_place():
     assert any(abs(weights @ moved) > 0.5 for _, weights in templates(signals, samples, positions=True))
 
 
+@pytest.mark.long
 def test_a_shipped_file_is_learned_again():
     """By steps and with bounds of places, as it was: the same invariants, to what another LAPACK may change."""
     held = load_envelope(FOLDER / "redundant.json")

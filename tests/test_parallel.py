@@ -42,7 +42,7 @@ def played(place, text, attack, seeds, **options):
     ({"scenario": "radar-following-v0", "defence": "cra", "interval": 40}, 8),
     ({"scenario": "thesis-ch5-v0", "defence": "chi2_dkf:eta=22.8", "interval": 10, "reward": "error"}, 6),
 ], ids=["car", "box", "platoon", "challenge", "network"])  # fmt: skip
-@pytest.mark.thin(3)
+@pytest.mark.thin(6)
 def test_pettingzoo_is_content(game, cycles):
     """parallel_api_test and parallel_seed_test pass without a warning, over the end of an episode and on every kind of system."""
     with warnings.catch_warnings():
@@ -57,7 +57,7 @@ def test_pettingzoo_is_content(game, cycles):
     ("stop-and-go-v0", "windowed_chi2_kf", "steered:defence=windowed_chi2_kf"), ("radar-following-v0", "cra", "steered_cra"),
     ("platoon-braking-v0", "chi2_dkf:eta=22.8", "steered:defence=chi2_dkf,defence.eta=22.8"),
 ])  # fmt: skip
-@pytest.mark.thin(3)
+@pytest.mark.thin(9)
 def test_knobs_that_nobody_turns_change_no_bit(place, plain, steered, short):
     """A steered defence at its own values gives the trace of the plain one, and at another setting another trace."""
     scene = short(place, horizon=120)

@@ -42,6 +42,7 @@ def alike(one: Any, two: Any) -> None:
     assert got.dtype == np.asarray(two).dtype and np.array_equal(got, two)
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=needs_compiler)])
 @pytest.mark.parametrize("kind", KINDS)
 def test_values_are_those_of_make_vec(kind: str, device: str, tmp_path: Any, host_card: HostCard) -> None:

@@ -147,7 +147,7 @@ def test_whole_episodes_with_collisions_and_beyond_them():
         assert [fast.trace_hash(b) for b in range(20)] == [plain.trace_hash(b) for b in range(20)]
 
 
-@pytest.mark.thin(5)
+@pytest.mark.thin(12)
 @pytest.mark.parametrize(("agents", "states", "sensors", "graph"), [(2, 2, 2, "path"), (7, 5, 3, "star"), (4, 9, 20, "complete")])
 @pytest.mark.parametrize("defence", ["dkf", "norm_resilient", "lasso_dkf", "consensus_kf"])
 def test_networks_of_any_size(agents, states, sensors, graph, defence):
