@@ -96,7 +96,7 @@ def test_rows_of_a_scenario_do_not_depend_on_their_batch(name, short, play):
     assert [some.trace_hash(0), some.trace_hash(1), alone.trace_hash(0)] == [known[5], known[2], known[4]]
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_outputs_are_finite_and_of_the_right_shape(defence, short, loop_of):
     """Without an attack and under every kind, with the widest jammer, a defence returns finite arrays of the declared shapes and types."""

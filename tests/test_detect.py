@@ -92,6 +92,7 @@ def test_a_finished_entry_is_kept_and_an_interrupted_one_costs_only_itself(
     assert main(command) == 0 and len(played) == 4
 
 
+@pytest.mark.long
 def test_what_an_older_version_could_not_have_is_played(bare: Data, detected: Data, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A filter that was left out for want of a threshold; a sentinel's line goes."""
     old = copy.deepcopy(detected)

@@ -179,6 +179,7 @@ def test_a_policy_is_played_as_its_file_says(tmp_path, monkeypatch):
         assert_same(place, run.played(theta, run.episodes_of("tune", 0, EPISODES)), wanted, "policy")
 
 
+@pytest.mark.long
 def test_starts(monkeypatch):
     """Rest and what a script does in every form, at its size and on its wires; published policies against the defence before others."""
     monkeypatch.setattr(networks, "SHOWN", 8)

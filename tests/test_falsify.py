@@ -206,6 +206,7 @@ def test_a_damaged_counterexample_is_refused(tmp_path, changes, expected):
 # The commands
 
 
+@pytest.mark.long
 def test_the_commands(tmp_path, capsys):
     out = str(tmp_path / "found")
     place = ["--property", "G[0,60] gap > 2.5", "--scenario", "braking-v0"]

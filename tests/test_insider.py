@@ -174,6 +174,7 @@ def test_learners_do_not_choose_it():
     assert {mode.kind for mode in both.modes} == {0, 5}
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("law", LAWS)
 def test_the_traced_engine_plays_it_to_the_bit(law, tmp_path, monkeypatch):
     """With the attack in plain code, and traced as well."""

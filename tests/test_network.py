@@ -282,7 +282,7 @@ def test_metrics_of_a_network(name):
     assert not got["crashed"].any() and (trace.length == 30).all()
 
 
-@pytest.mark.thin(6)
+@pytest.mark.long
 @pytest.mark.parametrize("name", NETWORKS)
 def test_published_networks(name):
     """Everybody can know the state together; the attacked agents exist and are not all; a clean distributed filter learns the state."""

@@ -365,6 +365,7 @@ def test_mp4_names_what_it_needs(monkeypatch, tmp_path, folder, capsys):
     assert "pip install 'tailgate[video]'" in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
+@pytest.mark.long
 def test_mp4_is_written(pick, tmp_path, monkeypatch):
     """A file that the decoder reads back: as many frames as pictures, and the last one held. A writer that dies leaves the film of before."""
     decoder = pytest.importorskip("imageio_ffmpeg")
