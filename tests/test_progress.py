@@ -12,9 +12,9 @@ from tailgate.base import progress
 from tailgate.ensemble import standard
 
 
-@pytest.mark.parametrize(("seconds", "words"), [(0.4, "0 s"), (59.4, "59 s"), (200.0, "3 min 20 s"), (7500.0, "2 h 5 min")])
+@pytest.mark.parametrize(("seconds", "words"), [(0.4, "0.4 s"), (59.4, "59 s"), (200.0, "3.3 min"), (7500.0, "2.1 h")])
 def test_times_in_words(seconds: float, words: str) -> None:
-    assert progress.said(seconds) == words
+    assert progress.lasting(seconds) == words
 
 
 def test_lines_have_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -27,7 +27,7 @@ def test_lines_have_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
         update("searches", 50, 100, "nothing new")
         update("searches", 100, 100, "10 of 10")
     assert out.getvalue().splitlines() == [
-        "searches: 40 %", "searches: 50 % 5 of 10 (30 s, about 2 min 30 s left)", "searches: 100 % 10 of 10 (1 min 1 s)",
+        "searches: 40 %", "searches: 50 % 5 of 10 (30 s, about 2.5 min left)", "searches: 100 % 10 of 10 (61 s)",
     ]  # fmt: skip
 
 

@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 
 from tailgate.base import sources
+from tailgate.base.progress import lasting
 from tailgate.base.provenance import cores, processor
 from tailgate.board import run_record
-from tailgate.board.attachments import Attachments, Run, lasting
+from tailgate.board.attachments import Attachments, Run
 from tailgate.board.files import load
 from tailgate.board.run_record import Record, processor_time
 from tailgate.cli import board as command

@@ -1,4 +1,4 @@
-"""How a policy is granted the threat model that it was trained under."""
+"""Options that grant a policy the threat model of its training."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from tailgate.core.threat import Brief, fit
 )  # fmt: skip
 @dataclass(frozen=True)
 class Insider(Script):
-    """A car scales the gains of its own law, of the spacing error and of its rate, and heeds no defence of its own."""
+    """A car scales the two gains of its law, on the spacing error and its rate, and ignores its defence."""
 
     kp_scale: Finite = param(0.0, "factor on the gain of the spacing error, cut at gain_bound [-]")
     kd_scale: Finite = param(-1.0, "factor on the gain of the error's rate, cut at gain_bound [-]")

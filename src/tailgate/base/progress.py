@@ -28,7 +28,7 @@ def progress(shown_on: Console) -> Iterator[Update]:
                 shown[label] = tenth
                 took = now - since
                 left = took * (total - done) / (done - before) if done > before else 0.0
-                times = f" ({said(took)}{f', about {said(left)} left' if left >= 60.0 else ''})" if took >= 1.0 else ""
+                times = f" ({lasting(took)}{f', about {lasting(left)} left' if left >= 60.0 else ''})" if took >= 1.0 else ""
                 shown_on.print(f"{label}: {10 * tenth} % {figures}".rstrip() + times, highlight=False, soft_wrap=True, markup=False)
 
         yield line
@@ -48,12 +48,10 @@ def progress(shown_on: Console) -> Iterator[Update]:
         yield bar
 
 
-def said(seconds: float) -> str:
-    """Return a time in words: 40 s, 3 min 20 s, 2 h 5 min."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    return f"{whole // 60} min {whole % 60} s" if whole < 3600 else f"{whole // 3600} h {whole % 3600 // 60} min"
+def lasting(seconds: float) -> str:
+    """Return a time as people say it."""
+    unit, name = next((u, n) for u, n in ((3600.0, "h"), (60.0, "min"), (1.0, "s")) if seconds >= 2 * u or u == 1.0)
+    return f"{seconds / unit:.2g} {name}" if seconds < 100 * unit else f"{seconds / unit:.0f} {name}"
 
 
 def cells(done: int, total: int) -> str:

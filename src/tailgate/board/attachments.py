@@ -19,6 +19,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from tailgate.base.errors import InputError
 from tailgate.base.files import write_atomic
+from tailgate.base.progress import lasting
 from tailgate.core.schema import read_model
 
 from .schema import Board, Dose, Interval, Limited, Part, Share
@@ -302,12 +303,6 @@ class Run(Attachment):
         stand, again = self.rows.played - self.rows.again, f" ({self.rows.again} played twice)" * bool(self.rows.again)
         share = f"all {rows}" if stand >= rows else f"{stand} of {rows}"
         return f"{share} rows{again} by {how} in {lasting(self.seconds)}, {lasting(self.processor_seconds)} of processor time ({where})"
-
-
-def lasting(seconds: float) -> str:
-    """Return a time as people say it."""
-    unit, name = next((u, n) for u, n in ((3600.0, "h"), (60.0, "min"), (1.0, "s")) if seconds >= 2 * u or u == 1.0)
-    return f"{seconds / unit:.2g} {name}" if seconds < 100 * unit else f"{seconds / unit:.0f} {name}"
 
 
 class Attachments(NamedTuple):

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from tailgate.base.errors import InputError
 from tailgate.base.files import writable_directory
-from tailgate.base.progress import cells, said
+from tailgate.base.progress import cells, lasting
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite
 from tailgate.core.schema import digest
@@ -85,7 +85,7 @@ def try_out(
         say(f"attacking {defence}: {entry['why']}")
         attack(
             suite, defence, folder / "attacked", workers=workers, progress=progress,
-            announce=lambda seconds: say(f"the searches take about {said(seconds)}"),
+            announce=lambda seconds: say(f"the searches take about {lasting(seconds)}"),
         )  # fmt: skip
         made = board_of(suite, folder, keep=keep, provisional=[defence])
         entry = _entry(made, defence)

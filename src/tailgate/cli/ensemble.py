@@ -7,7 +7,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from tailgate.base.progress import said
+from tailgate.base.progress import lasting
 from tailgate.cli.shared import Commands, add_options, own_classes, say, show, table, tell, working
 from tailgate.ensemble.members import BUDGETS
 
@@ -51,7 +51,7 @@ def _attack(options: argparse.Namespace) -> int:
         report = attack(
             load_suite(options.suite), options.defence, scenarios=options.scenario or (), doses=doses, budget=options.budget,
             seed=options.seed, episodes=options.episodes, workers=options.workers, out=out, progress=update,
-            announce=lambda seconds: tell(f"the searches take about {said(seconds)}"),
+            announce=lambda seconds: tell(f"the searches take about {lasting(seconds)}"),
         )  # fmt: skip
     if out is not None:
         write_atomic(out / "attacks.txt", "".join(f"{text}\n" for text in attacks_of(report)).encode())
