@@ -7,6 +7,7 @@ import lzma
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,10 +21,13 @@ from tailgate.board.run import board_of, files_of_rows
 from tailgate.board.score import score
 from tailgate.cli import board as command
 from tailgate.cli import main
+from tailgate.core import draws
+from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_suite
-from tailgate.ensemble import standard
+from tailgate.ensemble import search, standard
 from tailgate.ensemble.battery import Played
 from tailgate.ensemble.search import Arena
+from tailgate.estimators import Kalman
 from tailgate.evaluation.cells import Cell, run
 from tailgate.evaluation.rows import read_rows
 from tailgate.training.adaptive import SIZES, plan_of
@@ -33,13 +37,14 @@ from .conftest import shrink_ensemble
 TEXT = """about: s
 progress: 0.5
 measures: true
-scenarios: [radar-braking-v0]
+scenarios: [radar-braking-v0, radar-heavy-v0]
+robustness: [radar-heavy-v0]
 doses: [4, 9]
 defences: [none, chi2_kf, stand_still]
 attacks: [none, 'noise_jam:start_step=10']
 seeds: 8
 threat: {delay_bound: 60.0}
-adaptive: {ensemble: quick, doses: [4]}
+adaptive: {ensemble: quick, doses: [4], scenarios: [radar-braking-v0]}
 """
 
 
@@ -76,17 +81,22 @@ def test_one_command_searches_before_it_ranks(made: tuple[Path, Path], monkeypat
     data = json.loads((folder / "board.json").read_text())
     assert {e["defence"]: e["status"] for e in data["entries"]} == {"none": "unranked", "chi2_kf": "ranked", "stand_still": "unranked"}
     (line,) = data["searches"]
-    (cell,) = line["cells"]
-    assert (line["defence"], line["budget"], cell["dose"]) == ("chi2_kf", "quick", 4)
-    assert [one["member"] for one in cell["members"]] == [one.name for one in standard.MEMBERS]
+    cell, light = line["cells"]
+    assert (line["defence"], line["budget"], cell["dose"], light["dose"]) == ("chi2_kf", "quick", 4, 4)
+    assert [one["member"] for one in cell["members"]] == [one["member"] for one in light["members"]] == [one.name for one in standard.MEMBERS]
+    assert {one["member"] for one in light["members"] if one["why"] == standard.ELSEWHERE} == {"networks", "grey networks", "gradient"}
     found = [one["attack"] for one in cell["members"] if one["attack"]]
     best = {one["member"]: one["damage"] for one in cell["members"] if one["damage"] is not None}
     assert max(best.values()) == next(best[one["member"]] for one in cell["members"] if one["attack"])
-    for attack in found:
+    there = [one["attack"] for one in light["members"] if one["attack"]]
+    for attack in {*found, *there}:
         mine = [c for c in data["cells"] if c["attack"] == attack]
-        assert {(c["defence"], c["dose"]) for c in mine} >= {("chi2_kf", 4), ("chi2_kf", 9)} and all(c["n"] == 8 for c in mine)
+        places = {"radar-heavy-v0", *(["radar-braking-v0"] if attack in found else [])}
+        wanted = {(place, "chi2_kf", dose) for place in places for dose in (4, 9)}
+        assert {(c["scenario"], c["defence"], c["dose"]) for c in mine} >= wanted and all(c["n"] == 8 for c in mine)
     trained = {a["attack"]: a["trained_on"] for a in data["attacks"]}
-    assert trained == {"noise_jam:start_step=10": None} | dict.fromkeys(found, "chi2_kf")
+    assert trained == {"noise_jam:start_step=10": None} | dict.fromkeys([*found, *there], "chi2_kf")
+    found = [*dict.fromkeys([*found, *there])]
     in_files = [Path(attack.partition("path=")[2]) for attack in found if "path=" in attack]
     assert in_files and all(path.is_file() and path.parent == folder / "attacked" / "found" for path in in_files)
     page = Path("out/page/index.html").read_text()
@@ -122,7 +132,9 @@ def test_a_rank_asks_for_the_searches(made: tuple[Path, Path]) -> None:
     idle = [cell | {"members": [one | {"attack": None} for one in cell["members"]]} for cell in line["cells"]]
     assert why([line | {"cells": idle}]).endswith("not whole: not one attack of a black box")
     assert why([line | {"cells": []}]) == "the ensemble has not attacked it on radar-braking-v0 at dose 4"
-    assert why([line], [row for row in rows if row["attack"] != attack]) == f"what the ensemble found was not played on radar-braking-v0: {attack}"
+    for place in suite.scenarios:
+        left = [row for row in rows if (row["attack"], row["scenario"]) != (attack, place)]
+        assert why([line], left) == f"what the ensemble found was not played on {place}: {attack}"
     assert score([r for r in rows if r["defence"] != "chi2_kf"], suite, board=data)["searches"] == data["searches"]
     stale = data | {"searches": [line | {"version": 99}]}
     assert score(rows, suite, board=stale, searches=[line])["searches"] == [line]  # an entry that is made of rows takes their search
@@ -147,7 +159,7 @@ def test_a_rank_asks_for_the_searches(made: tuple[Path, Path]) -> None:
     ],
 )  # fmt: skip
 def test_plans_that_cannot_be_kept_are_refused(plan: str, words: str, tmp_path: Path) -> None:
-    (tmp_path / "s.yaml").write_text(TEXT.replace("{ensemble: quick, doses: [4]}", plan))
+    (tmp_path / "s.yaml").write_text(TEXT.replace("{ensemble: quick, doses: [4], scenarios: [radar-braking-v0]}", plan))
     with pytest.raises(InputError, match=words):
         load_suite(str(tmp_path / "s.yaml"))
 
@@ -252,3 +264,31 @@ def test_two_boards_in_a_folder_are_refused(tmp_path: Path) -> None:
         save({}, tmp_path / name)
     with pytest.raises(InputError, match="one board in the folder"):
         board_in(tmp_path)
+
+
+@pytest.mark.parametrize("attack", ["stealth:trigger=near,threshold=18", "zoo:name=car-following-chi2_kf-2", "fdi_gaussian:start_step=3,mean=-3,sd=1"])
+def test_whole_episodes_have_the_outcome_of_their_trace(attack: str) -> None:
+    """An attack that the engine traces is played in one program, a white box too; a step at a time says the same."""
+    spec, keys = Spec("attack", attack), draws.keys("select", range(24))
+    arena = Arena("test", "gusty-stop-and-go-v0", 10, "chi2_kf", dict(load_suite("car-following-v1").granted), None)
+    loop = arena.seat(spec.entry.knowledge, spec.make())
+    whole = search._whole(loop, spec.make(), keys)
+    assert whole is not None
+    for name, one, other in zip(Played._fields, whole, search._stepwise(loop, spec.make(), keys), strict=True):
+        assert np.array_equal(one, other), name
+
+
+@dataclasses.dataclass(frozen=True)
+class Late(Kalman):
+    """A filter whose score is no number from step 20 on."""
+
+    def step(self, plan: Any, state: Any, received: Any, known_u: Any, draws: Any) -> Any:
+        state, estimate = super().step(plan, state, received, known_u, draws)
+        return state, estimate._replace(score=np.where((draws.step >= 20)[:, None], np.inf, estimate.score))
+
+
+def test_a_defence_whose_numbers_are_refused_is_told_so_by_a_search() -> None:
+    """The program plays on behind a demand that failed; the search does not take its outcome."""
+    arena = Arena("test", "gusty-stop-and-go-v0", 10, f"{__name__}:Late", dict(load_suite("car-following-v1").granted), None)
+    with pytest.raises(InputError, match="defence output score: got 'NaN or infinity in step 20"):
+        arena.confirmed("fdi:start_step=3,value=-3", "select", 0, 16)

@@ -27,6 +27,7 @@ from tailgate.base.errors import Killed
 
 R = TypeVar("R")
 ENDING = 5.0  # [s] for an idle worker to end before it is killed
+THREADS = "OPENBLAS_NUM_THREADS"  # of numpy
 _SIGNALS = {signal.SIGINT, signal.SIGTERM}
 _crews: weakref.WeakSet[Crew] = weakref.WeakSet()
 _hired: ContextVar[Callable[[int], Hands] | None] = ContextVar("hired", default=None)  # who takes jobs in place of local workers
@@ -80,7 +81,8 @@ class _Worker:
         resource_tracker.ensure_running()  # started later, it would unblock the signals
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # inherited: a terminal's interrupt reaches the parent only
         try:
-            self.process.start()
+            with _single():
+                self.process.start()
         finally:
             theirs.close()
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -92,6 +94,19 @@ class _Worker:
         if self.process.is_alive():
             self.process.kill()
             self.process.join(ENDING)
+
+
+@contextlib.contextmanager
+def _single() -> Iterator[None]:
+    """Let processes that start here multiply matrices in one thread, unless the user says how many: workers would wait for each other."""
+    if THREADS in os.environ:
+        yield
+        return
+    os.environ[THREADS] = "1"
+    try:
+        yield
+    finally:
+        del os.environ[THREADS]
 
 
 class Crew:

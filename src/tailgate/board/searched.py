@@ -1,7 +1,8 @@
 """Attacks that the standard ensemble finds against a defence: a board asks for them before it ranks.
 
-The suite's plan names a budget. Every scenario is searched, at the plan's doses. Of each search the best attack of every class of knowledge
-is played, in that scenario at all doses. The results lie with the rows, and the board holds them, so that it can be scored without them.
+The suite's plan names a budget. Every scenario is searched, at the plan's doses; those who learn may search in the plan's scenarios only.
+Of each search the best attack of every class of knowledge is played, in that scenario at all doses (`attacks_of`). The results lie with
+the rows, and the board holds them, so that it can be scored without them.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def search(
     plan = plan_of(suite)
     if set(str(out)) & set(MARKS):
         raise InputError("--out", str(out), f"a path without any of {MARKS}, as the texts of attacks hold it")
-    jobs = jobs_of(suite, defence, (), plan.searched(suite), plan.ensemble, seed_of(beacon))
+    jobs = jobs_of(suite, defence, (), plan.searched(suite), plan.ensemble, seed_of(beacon), plan.scenarios)
     spec = Spec("defence", defence)
     folder = writable_directory(out / "searches" / stem(defence))
     with alone(folder):
@@ -117,12 +118,17 @@ def _placed(text: str, folder: Path) -> str:
     return f"{head}{folder / source.name}"
 
 
-def attacks_of(line: Data) -> dict[str, list[str]]:
-    """Return the attacks of a line that are played, by scenario."""
-    out: dict[str, list[str]] = {}
+def attacks_of(line: Data, whole: Collection[str] = ()) -> dict[str, list[str]]:
+    """Return the attacks of a line that are played, by scenario: where they were found.
+
+    whole: the scenarios where all members searched; what was found there is played in the others too. Empty: all members searched in all.
+    """
+    out: dict[str, list[str]] = {cell["scenario"]: [] for cell in line["cells"]}
     for cell in line["cells"]:
-        mine = out.setdefault(cell["scenario"], [])
-        mine += [one["attack"] for one in cell["members"] if one["attack"] is not None and one["attack"] not in mine]
+        found, origin = [one["attack"] for one in cell["members"] if one["attack"] is not None], cell["scenario"]
+        for name in out:
+            if name == origin or (origin in whole and name not in whole):
+                out[name] += [attack for attack in found if attack not in out[name]]
     return out
 
 
@@ -167,7 +173,7 @@ def unsearched(table: Table, row: Row, searches: Sequence[Data], plan: Adaptive)
     for name, value in own.items():
         if line[name] != value:
             return f"the ensemble attacked another {name}: {line[name] or 'none'}, not {value or 'none'}"
-    cells = {(cell["scenario"], cell["dose"]): cell for cell in line["cells"]}
+    cells, asked = {(cell["scenario"], cell["dose"]): cell for cell in line["cells"]}, attacks_of(line, plan.scenarios)
     index = table.defences.index(row["defence"])
     for name in table.scenarios:
         for dose in plan.searched(suite):
@@ -176,12 +182,9 @@ def unsearched(table: Table, row: Row, searches: Sequence[Data], plan: Adaptive)
                 return f"the ensemble has not attacked it on {name} at dose {dose}"
             if lacks := _lacking(cell):
                 return f"the search on {name} at dose {dose} is not whole: {lacks}"
-            played = {
-                one.attack for one, state in zip(table.attackers, table.state[name][index], strict=True) if (state == PLAYED).all()
-            }  # fmt: skip
-            found = {one["attack"] for one in cell["members"]} - {None} - table.withdrawn
-            if left := sorted(found - played):
-                return f"what the ensemble found was not played on {name}: {left[0]}"
+        played = {one.attack for one, state in zip(table.attackers, table.state[name][index], strict=True) if (state == PLAYED).all()}
+        if left := sorted(set(asked[name]) - table.withdrawn - played):
+            return f"what the ensemble found was not played on {name}: {left[0]}"
     return ""
 
 

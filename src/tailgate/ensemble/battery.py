@@ -134,10 +134,10 @@ class Battery:
 
 
 class Episodes:
-    """Episodes at their start, which can be played again with other parameters."""
+    """Episodes at their start, which can be played again with other parameters. broken: a demand failed in the last play."""
 
     def __init__(self, battery: Battery, keys: Keys, memory: object) -> None:
-        self.battery, self.horizon = battery, battery.loop.horizon
+        self.battery, self.horizon, self.broken = battery, battery.loop.horizon, False
         self.state = State(battery.program, len(keys.key))
         self.state.put(begun(battery.loop, keys, memory))
         self._first = self.state.memory.copy()
@@ -145,13 +145,13 @@ class Episodes:
 
     def play(self, values: list[Array] | None) -> Played:
         """Play all episodes under these parameters of the loop, the attack and its plan; None: those that were traced."""
-        state, call, done = self.state, self._call, 0
+        state, call, done, self.broken = self.state, self._call, 0, False
         state.memory[...] = self._first
         call.uniforms[...] = self.battery.program.uniforms(values)
         call.begin()
         while done < self.horizon and not state.get_leaf("loop.ended").all():
             call.play(min(STEPS, self.horizon - done))
-            done += STEPS
+            done, self.broken = done + STEPS, self.broken or call.broken
         return Played(*(state.get_leaf(name) for name in ("loop.ended", "gap", "error", "moved")))
 
 
@@ -198,9 +198,14 @@ def battery_of(loop: Loop, attack: Decider, plan: object, few: object) -> Batter
     """
     one = map_leaves(lambda leaf: leaf[:1], few)
     return _made.proved(
-        (loop, attack, plan), lambda: begun(loop, _keys(1), one), lambda: Battery(loop, attack, plan, one),
+        (loop, attack, plan), lambda: _sensed(loop, begun(loop, _keys(1), one)), lambda: Battery(loop, attack, plan, one),
         lambda found, values: found.of(loop, attack, plan, values), lambda made: _difference(made, few),
     )  # fmt: skip
+
+
+def _sensed(loop: Loop, first: dict[str, Any]) -> dict[str, Any]:
+    loop.sense(first["loop"])  # caches what an attacker's view needs
+    return first
 
 
 def _keys(batch: int) -> Keys:

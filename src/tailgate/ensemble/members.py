@@ -41,10 +41,10 @@ class Budget:
         """The search of policies."""
         return Race(self.population, tuple(Phase(*phase) for phase in self.phases))
 
-    def episodes(self, agents: int) -> int:
-        """Return the episodes that all members play in a scenario, about."""
+    def episodes(self, agents: int, whole: bool = True) -> int:
+        """Return the episodes that all members play in a scenario, about; those that do not learn unless `whole`."""
         races = self.race.episodes(STARTS, agents) + self.race.episodes(GREY + PUBLISHED, agents)
-        return self.scripts.episodes(agents) + self.programs.episodes(agents) + races
+        return self.scripts.episodes(agents) + self.programs.episodes(agents) + (races if whole else 0)
 
 
 BUDGETS = {
@@ -144,16 +144,17 @@ class Member(NamedTuple):
     name: str
     knowledge: str
     find: Callable[[Hunt], list[str]]  # attacks as on the command line
+    learns: bool = False  # takes most of the time of a search
 
 
 MEMBERS = (
     Member("scripts", "black", _scripts),
     Member("programs", "black", _programs),
     Member("transfer", "black", _transfer),
-    Member("networks", "black", lambda hunt: _policies(hunt, "black")),
-    Member("grey networks", "grey", lambda hunt: _policies(hunt, "grey")),
+    Member("networks", "black", lambda hunt: _policies(hunt, "black"), learns=True),
+    Member("grey networks", "grey", lambda hunt: _policies(hunt, "grey"), learns=True),
     Member("white box", "white", _white_box),
-    Member("gradient", "white", _gradient),
+    Member("gradient", "white", _gradient, learns=True),
 )
 
 

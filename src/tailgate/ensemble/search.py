@@ -18,12 +18,12 @@ import numpy as np
 
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Attack, draws
-from tailgate.core.draws import Keys
+from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import Loop
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
 from tailgate.engine.agreement import ROWS, Untraced
-from tailgate.ensemble.battery import Played, Scripts, battery_of, played_plainly, remembered
+from tailgate.ensemble.battery import Episodes, Played, Scripts, battery_of, played_plainly, remembered
 from tailgate.ensemble.programs import Programs
 from tailgate.ensemble.space import Sequence, Space, road_of
 from tailgate.evaluation.cells import Cell
@@ -212,10 +212,8 @@ class Arena:
         """Return the outcome of an attack (episodes,), as `evaluate` plays it, and the distances that it is judged by (`reach`)."""
         spec = Spec("attack", text)
         attack = spec.make()
-        loop = self.seat(spec.entry.knowledge, attack)
-        trace = rollout(loop, attack, draws.keys(purpose, range(first, first + episodes)))
-        gap = METRICS["min_gap"](trace) if loop.model.followers.any() else np.full(episodes, np.inf)
-        played = Played(METRICS["crashed"](trace) > 0, gap, *(METRICS[name](trace) for name in ("max_error", "distance_travelled")))
+        loop, keys = self.seat(spec.entry.knowledge, attack), draws.keys(purpose, range(first, first + episodes))
+        played = _whole(loop, attack, keys) or _stepwise(loop, attack, keys)
         return played, self.reach(purpose, first, episodes)
 
     def confirmed(self, text: str, purpose: str, first: int, episodes: int) -> tuple[float, float]:
@@ -235,6 +233,28 @@ class Arena:
         """Return attacks after the last stage, on select episodes that they all meet, the most harmful first."""
         found = [Found(text, *self.confirmed(text, "select", 0, FINAL), FINAL) for text in dict.fromkeys(texts)]
         return sorted(found, key=lambda one: -one.score)
+
+
+def _whole(loop: Loop, attack: Attack, keys: Keys) -> Played | None:
+    """Return the outcome of whole episodes in one program; None where the engine does not trace the attack, or a demand is broken."""
+    plan = attack.prepare(loop.brief)
+
+    def memory(keys: Keys) -> object:
+        return attack.start(plan, len(keys.key), keys.at(Role.ATTACK, np.zeros(len(keys.key), np.int64)))
+
+    battery = battery_of(loop, attack, plan, memory(draws.keys("tune", range(ROWS))))
+    if isinstance(battery, Untraced):
+        return None
+    episodes = Episodes(battery, keys, memory(keys))
+    played = episodes.play(battery.values)
+    return None if episodes.broken else played
+
+
+def _stepwise(loop: Loop, attack: Attack, keys: Keys) -> Played:
+    """Return the outcome of episodes from their trace."""
+    trace = rollout(loop, attack, keys)
+    gap = METRICS["min_gap"](trace) if loop.model.followers.any() else np.full(len(keys.key), np.inf)
+    return Played(METRICS["crashed"](trace) > 0, gap, *(METRICS[name](trace) for name in ("max_error", "distance_travelled")))
 
 
 class Pool(NamedTuple):

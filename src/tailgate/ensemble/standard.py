@@ -10,7 +10,7 @@ import contextlib
 import json
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +26,7 @@ from tailgate.core.scenario import Suite, load_scenario
 from tailgate.core.schema import digest
 from tailgate.core.spec_text import MARKS
 from tailgate.ensemble.gradient import gradient_masking
-from tailgate.ensemble.members import BUDGETS, MEMBERS, Hunt, harvest
+from tailgate.ensemble.members import BUDGETS, MEMBERS, Harvest, Hunt, harvest
 from tailgate.ensemble.search import FINAL, Arena, Found
 from tailgate.evaluation.cells import Cell, run
 from tailgate.evaluation.rows import CLEAN
@@ -34,6 +34,8 @@ from tailgate.evaluation.stats import proportion
 
 NAME = "standard-v1"
 BLACK = tuple(member.name for member in MEMBERS if member.knowledge == "black")
+UNLEARNED = tuple(member.name for member in MEMBERS if not member.learns)
+ELSEWHERE = "it searches in the suite's main scenarios"
 SHOWN = 3  # attacks of a member that are kept
 REST = 2.5  # a whole search over its searched episodes: confirming, learning, white boxes and gradients take as long again, and more
 PAUSE = 5.0  # between two looks at the progress of searches in other processes [s]
@@ -47,6 +49,7 @@ class Job(NamedTuple):
     budget: str
     seed: int
     listed: tuple[str, ...]  # the suite's attacks
+    whole: bool = True  # all members search; else those that do not learn
 
     @property
     def name(self) -> str:
@@ -57,8 +60,10 @@ class Job(NamedTuple):
         return f"{one.name}-{'own' if one.dose is None else one.dose}-{digest([NAME, *code, *map(str, self)])}"
 
 
-def jobs_of(suite: Suite, defence: str, scenarios: Sequence[str], doses: Sequence[int | None], budget: str, seed: int) -> list[Job]:
-    """Return the searches against a defence, checked.
+def jobs_of(
+    suite: Suite, defence: str, scenarios: Sequence[str], doses: Sequence[int | None], budget: str, seed: int, whole: Collection[str] = (),
+) -> list[Job]:  # fmt: skip
+    """Return the searches against a defence, checked. whole: the scenarios where all members search; empty: all.
 
     Raises
     ------
@@ -86,7 +91,7 @@ def jobs_of(suite: Suite, defence: str, scenarios: Sequence[str], doses: Sequenc
         except NotApplicable as error:
             why = str(error)
         else:
-            played.append(Job(arena, budget, seed, suite.attacks))
+            played.append(Job(arena, budget, seed, suite.attacks, not whole or arena.scenario in whole))
     if not played:
         raise InputError("defence", defence, f"one with a meaning in suite {suite.name} ({why})")
     return played
@@ -97,7 +102,7 @@ def expected(jobs: Sequence[Job], workers: int) -> float:
     arena = jobs[0].arena
     if not arena.space.families:
         return 0.0
-    steps = sum(BUDGETS[job.budget].episodes(job.arena.loop.model.agents) * job.arena.loop.horizon for job in jobs)
+    steps = sum(BUDGETS[job.budget].episodes(job.arena.loop.model.agents, job.whole) * job.arena.loop.horizon for job in jobs)
     return REST * steps / (arena.speed() * arena.loop.horizon) / min(workers, len(jobs))
 
 
@@ -107,7 +112,9 @@ def search(job: Job, folder: Path, tell: Callable[[int, int, str, float], None] 
     folder: where files of attacks are written.
     """
     arena = job.arena
-    members = harvest(Hunt(arena, BUDGETS[job.budget], job.seed, folder / "attacks" / job.name, tell))
+    hunt = Hunt(arena, BUDGETS[job.budget], job.seed, folder / "attacks" / job.name, tell, () if job.whole else UNLEARNED)
+    found = {one.member: one for one in harvest(hunt)}
+    members = [found.get(one.name, Harvest(one.name, one.knowledge, [], ELSEWHERE)) for one in MEMBERS]
     return {
         "scenario": arena.name, "place": arena.scenario, "dose": arena.dose, "listed": _strongest(arena, job.listed),
         "members": [one._asdict() | {"found": [found._asdict() for found in one.found[:SHOWN]]} for one in members],
