@@ -116,7 +116,7 @@ def test_a_module_that_is_not_there_is_looked_for_in_the_working_directory(tmp_p
 
 
 def test_a_plant_of_a_file_is_registered_in_python():
-    with pytest.raises(InputError, match=r"a name that @register\('plant', NAME\) of tailgate.core.registry .* before it is used: a file imports"):
+    with pytest.raises(InputError, match=r"an entry point of the group tailgate.plants, or in Python one that @register\('plant', NAME\) has given: a file imports"):
         make_from("plant", "myplant:Mine", "scenario s.plant")
 
 

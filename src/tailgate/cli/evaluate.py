@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +34,8 @@ def add(commands: Commands) -> None:
                          help="a scenario (repeatable); alone: with its own threat model, with --suite: with the suite's")  # fmt: skip
     add_options(command, "--dose", "--threat")
     command.add_argument("--seeds", type=int, metavar="N", help="episodes per cell instead of the suite's")
+    command.add_argument("--metric", action="append", metavar="NAME",
+                         help="a metric of your own (repeatable): module:function, or an entry point; a column of rows")  # fmt: skip
     add_options(command, "--purpose")
     command.add_argument("--batch", type=int, default=256, metavar="N", help="episodes side by side (default 256); changes no result")
     add_options(command, "--workers", "--device", "--engine", "--address")
@@ -60,14 +64,15 @@ def _evaluate(options: argparse.Namespace) -> int:
         rows = evaluate(
             suite, defences=options.defence, attacks=options.attack, scenarios=options.scenario, doses=doses,
             seeds=options.seeds, purpose=options.purpose, batch=options.batch, workers=options.workers,
-            out=options.out, threat=threat, progress=counted(update, "playing"),
+            out=options.out, threat=threat, progress=counted(update, "playing"), metrics=options.metric or (),
         )  # fmt: skip
     for earlier in sorted(aside(options.out) - before):
         tell(f"{options.out} held something else than these rows; it is in {earlier}")
     table = summarise(rows)
-    show(options, table, _print_summary)
-    own = options.suite is None and options.scenario and doses is None and "budget" not in threat
-    if own and not options.json and any(row["attack"] != "none" for row in rows):
+    own = rows[0].get("metrics", []) if rows else []
+    show(options, table, partial(_print_summary, own=own))
+    alone = options.suite is None and options.scenario and doses is None and "budget" not in threat
+    if alone and not options.json and any(row["attack"] != "none" for row in rows):
         lasting = " (unlimited: attacks may last the whole episode)" if any(entry["dose"] is None for entry in table) else ""
         say(f"no --dose: the scenario's own budget{lasting}")
     if options.plot:
@@ -112,13 +117,13 @@ def _dependent(rows: list[dict[str, Any]]) -> list[str]:
     return out
 
 
-def _print_summary(summary: list[dict[str, Any]]) -> None:
+def _print_summary(summary: list[dict[str, Any]], own: Sequence[str] = ()) -> None:
     for place in dict.fromkeys((e["scenario"], e["dose"]) for e in summary):
         scenario, dose = place
         here = [entry for entry in summary if (entry["scenario"], entry["dose"]) == place]
         road = any(entry["crash"] and entry["min_gap"] for entry in here)  # else nothing drives, and an error has no unit
         errors = ("min gap [m]", "max error [m]") if road else ("RMS error", "max error")
-        measures = ("n", *(("collisions", "95 % interval") if road else ()), *errors, "alarm onsets")
+        measures = ("n", *(("collisions", "95 % interval") if road else ()), *errors, "alarm onsets", *own)
         why = any(entry["crash"] is None or entry["refused_all"] for entry in here)
         rows = []
         for entry in here:
@@ -127,7 +132,7 @@ def _print_summary(summary: list[dict[str, Any]]) -> None:
                 rows.append([*head, *["-"] * (len(measures) - 1), entry["reason"] if crash is None else REFUSED])
                 continue
             figures = [f"{100 * crash['value']:.1f} %", f"{100 * crash['low']:.1f} to {100 * crash['high']:.1f} %"] if road else []
-            keys = ("min_gap" if road else "rmse_position", "max_error", "alarm_onsets")
+            keys = ("min_gap" if road else "rmse_position", "max_error", "alarm_onsets", *own)
             rows.append([*head, *figures, *(f"{entry[k]['median']:.2f}" if entry[k] else "-" for k in keys)])
         columns = ("defence", "attack", "knowledge", *measures, *(("why not",) if why else ()))
         table(columns, rows, f"{scenario}, budget {'unlimited' if dose is None else f'{dose} steps'}")

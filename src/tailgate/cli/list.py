@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
 from rich.table import Table
@@ -15,13 +17,15 @@ from tailgate.base.progress import console
 from tailgate.cli.shared import Commands, print_json
 from tailgate.cli.shared import table as show_table
 
+if TYPE_CHECKING:
+    from tailgate.core.registry import Family
+
 
 def add(commands: Commands) -> None:
     """Add `list` to the commands."""
-    about = "what there is: defences and their parts, attacks, the zoo, scenarios, suites, traces; or a graph"
+    about = "what there is: defences, attacks, the zoo, scenarios and their parts, suites, metrics, traces; or a graph"
     command = commands.add_parser("list", help=about)
-    groups = ["defences", "filters", "detectors", "mitigations", "attacks", "zoo", "scenarios", "suites", "traces"]
-    command.add_argument("what", nargs="?", choices=groups, help="only these; attacks: with the zoo of trained policies")
+    command.add_argument("what", nargs="?", choices=list(_cards()), help="only these; attacks: with the zoo of trained policies")
     command.add_argument("--all", action="store_true", help="everything, with parameters (default: how many there are of each)")
     command.add_argument("--graph", metavar="SCENARIO", help="draw who hears whom in this scenario instead (needs tailgate[viz])")
     command.add_argument("--out", metavar="FILE", help="the drawing: .png (default: SCENARIO.png), .svg or .pdf")
@@ -34,31 +38,14 @@ def _list(options: argparse.Namespace) -> int:
         return _draw(options)
     if options.out is not None:
         raise InputError("--out", options.out, "a drawing to write: --graph SCENARIO")
-    from tailgate.agents.policy.zoo import zoo_card, zoo_names
-    from tailgate.core.registry import entries
-    from tailgate.core.scenario import list_scenarios, list_suites, load_scenario, load_suite
-    from tailgate.core.traces import as_card
-    from tailgate.core.traces import cards as trace_cards
-
-    cards: dict[str, list[dict[str, Any]]] = {
-        "defences": [entry.card() for entry in entries("defence").values()],
-        "filters": [entry.card() for entry in entries("filter").values()],
-        "detectors": [entry.card() for entry in entries("detector").values()],
-        "mitigations": [entry.card() for entry in entries("mitigation").values()],
-        "attacks": [entry.card() for entry in entries("attack").values()],
-        "zoo": [zoo_card(name) for name in zoo_names()],
-        "scenarios": [{"name": name, "summary": load_scenario(name).about} for name in list_scenarios()],
-        "suites": [{"name": name, "summary": load_suite(name).about} for name in list_suites()],
-        "traces": [as_card(name) for name in trace_cards()],
-    }
     wanted = ("attacks", "zoo") if options.what == "attacks" else (options.what,)
-    chosen = {key: value for key, value in cards.items() if options.what is None or key in wanted}
+    chosen = {key: cards() for key, cards in _cards().items() if options.what is None or key in wanted}
     if options.json:
         print_json(chosen)
         return 0
     out = console()
     if options.what is None and not options.all:
-        counts = [(name, str(len(group)), f"tailgate list {name}") for name, group in cards.items()]
+        counts = [(name, str(len(group)), f"tailgate list {name}") for name, group in chosen.items()]
         show_table(("what", "how many", "listed by"), counts, caption="tailgate list --all: everything", numbers=(1,))
         return 0
     for title, group in chosen.items():
@@ -74,6 +61,53 @@ def _list(options: argparse.Namespace) -> int:
             table.add_row(*map(escape, (card["name"], card["summary"], fields)))
         out.print(table)
     return 0
+
+
+def _cards() -> dict[str, Callable[[], list[dict[str, Any]]]]:
+    """Return the groups, each with a function that returns its cards."""
+    families: tuple[Family, ...] = (
+        "defence", "filter", "detector", "mitigation", "attack", "plant", "sensor", "controller", "manoeuvre", "reward",
+    )  # fmt: skip
+    groups: dict[str, Callable[[], list[dict[str, Any]]]] = {f"{family}s": partial(_registered, family) for family in families}
+    return groups | {"metrics": _metrics, "zoo": _zoo, "scenarios": _scenarios, "suites": _suites, "traces": _traces}
+
+
+def _registered(family: Family) -> list[dict[str, Any]]:
+    from tailgate.core.registry import entries
+
+    return [entry.card() for entry in entries(family).values()]
+
+
+def _metrics() -> list[dict[str, Any]]:
+    from tailgate.core.registry import summary_of
+    from tailgate.play.metrics import METRICS, UNITS, own_metrics
+
+    found = METRICS | {one.name: one.function for one in own_metrics()}
+    return [{"name": name, "summary": summary_of(function), "unit": UNITS.get(name, "-")} for name, function in sorted(found.items())]
+
+
+def _zoo() -> list[dict[str, Any]]:
+    from tailgate.agents.policy.zoo import zoo_card, zoo_names
+
+    return [zoo_card(name) for name in zoo_names()]
+
+
+def _scenarios() -> list[dict[str, Any]]:
+    from tailgate.core.scenario import list_scenarios, load_scenario
+
+    return [{"name": name, "summary": load_scenario(name).about} for name in list_scenarios()]
+
+
+def _suites() -> list[dict[str, Any]]:
+    from tailgate.core.scenario import list_suites, load_suite
+
+    return [{"name": name, "summary": load_suite(name).about} for name in list_suites()]
+
+
+def _traces() -> list[dict[str, Any]]:
+    from tailgate.core.traces import as_card, cards
+
+    return [as_card(name) for name in cards()]
 
 
 def _zoo_table(group: list[dict[str, Any]]) -> Table:

@@ -1,4 +1,4 @@
-"""Somebody else's classes, named as module:Class: how they are imported, and what is said of those that are not there."""
+"""Somebody else's classes and functions, named as module:NAME: how they are imported, and what is said of those that are not there."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import difflib
 import importlib
 import sys
 import traceback
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from tailgate.base.errors import InputError, unknown
@@ -29,23 +29,32 @@ def said(error: Exception) -> str:
 
 def class_of(family: str, text: str) -> type:
     """Return the class that the user names as module:Class. Raises InputError that says which of both is not there, and what is."""
+    cls = attribute_of(family, text, lambda value: isinstance(value, type), "class")
+    if not isinstance(cls, type):
+        raise InputError(family, text, "a class")
+    return cls
+
+
+def attribute_of(family: str, text: str, fits: Callable[[object], bool], kind: str) -> object:
+    """Return what the user names as module:NAME. Raises InputError that says which of both is not there, and what is.
+
+    fits: if an object of that module is of this kind, a word.
+    """
     module, _, name = text.partition(":")
     try:
         held = importlib.import_module(module)
-        cls = getattr(held, name, None)
+        found = getattr(held, name, None)
     except (ImportError, ValueError, TypeError) as error:  # also an empty or relative module name
         raise InputError(family, text, f"an importable module ({error}){_searched(module, error)}") from None
     except SyntaxError as error:
         raise InputError(family, text, f"a module without syntax errors ({error.msg}, line {error.lineno})") from None
     except Exception as error:  # whatever its first lines do
         raise InputError(family, text, f"a module that can be imported ({said(error)})") from None
-    if cls is None:
-        own = sorted(key for key, value in vars(held).items() if isinstance(value, type) and value.__module__ == module)
+    if found is None:
+        own = sorted(key for key, value in vars(held).items() if fits(value) and getattr(value, "__module__", "") == module)
         shown = ", ".join(own[:SHOWN]) + (f" and {len(own) - SHOWN} more" if len(own) > SHOWN else "")
-        raise InputError(family, text, f"a class that module {module} defines{_near(name, own)}" + (f": {shown}" if own else ""))
-    if not isinstance(cls, type):
-        raise InputError(family, text, "a class")
-    return cls
+        raise InputError(family, text, f"a {kind} that module {module} defines{_near(name, own)}" + (f": {shown}" if own else ""))
+    return found
 
 
 def _searched(module: str, error: Exception) -> str:
@@ -70,6 +79,6 @@ def unregistered(family: str, name: str, known: Iterable[str], imports: bool) ->
     if imports and name[:1].isupper() and name.isidentifier():
         return InputError(family, name, f"a class of yours as module:{name}, or {error.expected}")
     if not imports and ":" in name:
-        how = f"a name that @register({family!r}, NAME) of tailgate.core.registry has given to the class, in Python, before it is used"
+        how = f"the name of an entry point of the group tailgate.{family}s, or in Python one that @register({family!r}, NAME) has given"
         return InputError(family, name, f"{how}: a file imports nothing; registered are {', '.join(sorted(known))}")
     return error

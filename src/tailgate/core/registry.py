@@ -1,7 +1,7 @@
 """Names to components. A component is a frozen dataclass; its fields are its parameters.
 
-Built-in ones register where they are defined; others come from the entry-point groups `tailgate.estimators` and `tailgate.agents`,
-from `module:Class` on the command line, or as objects in Python. A configuration file names registered components only.
+Built-in ones register where they are defined; others come from entry points (`GROUPS`), from `module:Class` on the command line,
+or as objects in Python. A configuration file names registered components only.
 """
 
 import hashlib
@@ -38,7 +38,9 @@ _MODULES = {
     "reward": "tailgate.envs",
     "learner": "tailgate.agents",
 }
-_GROUPS = {"defence": "tailgate.estimators", "attack": "tailgate.agents"}
+GROUPS: dict[str, str] = {family: f"tailgate.{family}s" for family in _MODULES} | {
+    "defence": "tailgate.estimators", "attack": "tailgate.agents", "metric": "tailgate.metrics",
+}  # fmt: skip
 SANDBOXES = ("bwrap", "docker")
 _FILES = {".json": "policy", ".yaml": "program", ".yml": "program"}  # attacks that are files
 PARTS: tuple[Family, ...] = ("filter", "detector", "mitigation")  # of the defence `composed`
@@ -85,7 +87,7 @@ class Entry:
 
     @property
     def summary(self) -> str:
-        return (inspect.getdoc(self.cls) or "").split("\n\n")[0].replace("\n", " ")
+        return summary_of(self.cls)
 
     def card(self) -> dict[str, Any]:
         """Return JSON data: name, version, reference, uses and every parameter with its default and sentence."""
@@ -98,6 +100,11 @@ class Entry:
         if self.family == "attack":
             out |= {"knowledge": self.knowledge, "optimal": self.optimal, "learned": self.learned}
         return out | {"parameters": params}
+
+
+def summary_of(value: object) -> str:
+    """Return the first paragraph of a docstring in one line."""
+    return (inspect.getdoc(value) or "").split("\n\n")[0].replace("\n", " ")
 
 
 def register(family: Family, name: str, **card: Unpack[Card]) -> Callable[[T], T]:
@@ -136,8 +143,7 @@ def built_in(family: Family) -> dict[str, Entry]:
 
 def _load(family: Family) -> dict[str, Entry]:
     built_in(family)
-    group = _GROUPS.get(family)
-    if group and group not in _plugins_loaded:
+    if (group := GROUPS[family]) not in _plugins_loaded:
         for point in entry_points(group=group):
             try:
                 cls = point.load()
@@ -284,8 +290,7 @@ class Spec:
     @property
     def foreign(self) -> bool:
         """True if playing this runs somebody else's code outside of any sandbox: a class to import, or a plug-in."""
-        plugged = _plugged(entry_points, _GROUPS[self.family]) if self.family in _GROUPS else frozenset()
-        return self.imports or (not self.sandboxed and self._parts()[0] in plugged)
+        return self.imports or (not self.sandboxed and self._parts()[0] in _plugged(entry_points, GROUPS[self.family]))
 
     @property
     def digest(self) -> str:

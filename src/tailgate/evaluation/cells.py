@@ -10,6 +10,7 @@ import contextlib
 import copy
 import dataclasses
 import hashlib
+import inspect
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -34,10 +35,11 @@ from tailgate.evaluation.frame import Rows
 from tailgate.evaluation.resume import complete
 from tailgate.evaluation.rounds import numbered
 from tailgate.evaluation.rows import packed
-from tailgate.play.metrics import METRICS, measure
+from tailgate.play.metrics import METRICS, Own, measure, own_metric
 from tailgate.play.trace import Trace, episode_memory, episodes_at_once, rollout
 
 ENGINE = "plain"
+RESULT = ("seed", "status", "reason", "trace_hash", "decision_hash")  # columns that the head of a row has not, next to metrics
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,7 @@ class Cell:
     batch: int = 256
     threat: dict[str, Any] = field(default_factory=dict)
     beacon: str = ""
+    metrics: tuple[str, ...] = ()  # of somebody's own, as `own_metric` takes them
 
     @property
     def episodes(self) -> Sequence[int]:
@@ -95,6 +98,7 @@ def run_cell(
     head = _head(cell, place, defence_entry, attack_entry, identity)
     rows: list[dict[str, Any]] = []
     seeds = cell.episodes
+    own = [own_metric(text) for text in cell.metrics]
     try:
         loop = place.loop(defence, defence_entry.uses if uses is None else uses)
         size = episodes_at_once(loop.model, loop.horizon, cell.batch)
@@ -103,15 +107,15 @@ def run_cell(
     for start in range(0, cell.seeds, size):
         chunk = seeds[start : start + size]
         try:
-            rows += _played(head, chunk, rollout(loop, attack, draws.keys(cell.purpose, chunk)))
+            rows += _played(head, chunk, rollout(loop, attack, draws.keys(cell.purpose, chunk)), own)
         except Exception as error:  # a component may raise anything; only its own rows are lost
             rows += _failed(head, chunk, *_why(error, chunk))
     return rows
 
 
-def _played(head: dict[str, Any], seeds: Sequence[int], trace: Trace) -> list[dict[str, Any]]:
+def _played(head: dict[str, Any], seeds: Sequence[int], trace: Trace, own: Sequence[Own] = ()) -> list[dict[str, Any]]:
     """Return the rows of a trace, one per seed."""
-    rows, values = [], measure(trace)
+    rows, values = [], measure(trace) | {one.name: one(trace) for one in own}
     for i, seed in enumerate(seeds):
         numbers = {name: None if np.isnan(v[i]) else float(v[i]) for name, v in values.items()}
         hashes = {"trace_hash": trace.trace_hash(i), "decision_hash": trace.decision_hash(i)}
@@ -131,7 +135,7 @@ def _why(error: Exception, seeds: Sequence[int] = ()) -> tuple[str, str]:
 
 def _head(cell: Cell, place: Scenario, defence: Entry, attack: Entry, identity: str) -> dict[str, Any]:
     threat = place.threat_model
-    return {
+    head = {
         "suite": cell.suite, "scenario": place.name, "scenario_file": cell.scenario if cell.scenario.endswith(YAML_ENDS) else "",
         "threat_model": as_data(threat), "dose": threat.budget,
         "knowledge": threat.knowledge, "defence": cell.defence, "uses": list(defence.uses), "attack": cell.attack,
@@ -141,6 +145,10 @@ def _head(cell: Cell, place: Scenario, defence: Entry, attack: Entry, identity: 
         "config_hash": place.config_hash, "version": VERSION, "cell": identity,
         "trained": origin(cell.attack) if identity else None, **({} if device() == "cpu" else {"device": device()}),
     }  # fmt: skip
+    own = [own_metric(text).name for text in cell.metrics]
+    if taken := [name for name in own if name in (*head, *RESULT)]:
+        raise InputError("metric", taken[0], "a name that is no column of a row")
+    return head | ({"metrics": own} if own else {})
 
 
 def origin(attack: str) -> dict[str, Any] | None:
@@ -156,7 +164,7 @@ def _digest(family: Family, text: str, identity: str) -> str:
 
 
 def _failed(head: dict[str, Any], seeds: Iterable[int], reason: str, status: str = "error") -> list[dict[str, Any]]:
-    empty = dict.fromkeys(METRICS) | {"trace_hash": None, "decision_hash": None}
+    empty = dict.fromkeys([*METRICS, *head.get("metrics", ())]) | {"trace_hash": None, "decision_hash": None}
     text = " ".join(reason.split())[:500]
     return [_own(head) | {"seed": seed, "status": status, "reason": text, **empty} for seed in seeds]
 
@@ -177,8 +185,20 @@ def cell_id(cell: Cell) -> str:
     """Return a hash of everything that determines a cell's rows; a finished cell with this id is not played again."""
     data = dataclasses.asdict(cell)
     data["sources"] = [Spec("defence", cell.defence).digest, Spec("attack", cell.attack).digest]
-    data["scenario"] = load_scenario(cell.scenario).config_hash
+    place = load_scenario(cell.scenario)
+    data["scenario"] = place.config_hash
+    parts = [place.plant, place.sensor, place.controller, place.manoeuvre]
+    data["code"] = [_code(one) for one in (*map(type, parts), *(own_metric(text).function for text in cell.metrics))]
     return hashlib.blake2b(f"{VERSION}/{sources.own()}/{canonical(data)}".encode(), digest_size=12).hexdigest()
+
+
+def _code(value: Any) -> str:
+    """Return the hash of the file that defines somebody's class or function; empty for one of this package, or without a file."""
+    if value.__module__.partition(".")[0] == "tailgate":
+        return ""
+    with contextlib.suppress(OSError, TypeError):
+        return hashlib.sha256(Path(inspect.getfile(value)).read_bytes()).hexdigest()
+    return ""
 
 
 @contextlib.contextmanager
@@ -195,15 +215,16 @@ def _sparing() -> Iterator[None]:
 
 
 def cells_of(
-    suite: Suite, *, batch: int = 256, purpose: str = "report", threat: dict[str, Any] | None = None, beacon: str = "", first_seed: int = 0
-) -> list[Cell]:
+    suite: Suite, *, batch: int = 256, purpose: str = "report", threat: dict[str, Any] | None = None, beacon: str = "",
+    first_seed: int = 0, metrics: Sequence[str] = (),
+) -> list[Cell]:  # fmt: skip
     """Return the cells of a suite in order, from episode `first_seed` on; raise InputError for anything that does not exist."""
     if purpose not in draws.PURPOSES:
         raise InputError("purpose", purpose, f"one of {', '.join(draws.PURPOSES)}")
     _ = numbered(beacon, suite.name, purpose, 0, 1)  # checks the beacon
     changes = suite.granted | dict(threat or {})
     out = [
-        Cell(suite.name, scenario, dose, defence, attack, suite.seeds, purpose, first_seed, batch, changes, beacon)
+        Cell(suite.name, scenario, dose, defence, attack, suite.seeds, purpose, first_seed, batch, changes, beacon, tuple(metrics))
         for scenario in suite.scenarios for dose in suite.doses for defence in suite.defences for attack in suite.attacks
     ]  # fmt: skip
     models: dict[str, Model] = {}
@@ -274,6 +295,7 @@ def evaluate(
     beacon: str = "",
     progress: Callable[[int, int], None] | None = None,
     device: str | None = None,
+    metrics: str | Sequence[str] = (),
 ) -> Rows:
     """Play a suite, or the part of it given by the arguments, and return its rows: a list, which a notebook shows as a table.
 
@@ -286,6 +308,7 @@ def evaluate(
     beacon : the round that the episodes belong to
     batch, workers : episodes played together, and processes; they change no bit
     out : file for the rows
+    metrics : your own, one or a list: names of entry points, or module:function; a column of the rows each
     device : cpu or cuda; changes no bit. None is that of `tailgate.engine.cards.playing_on`, cpu if nobody chose
 
     Raises
@@ -297,7 +320,7 @@ def evaluate(
         with playing_on(device):
             return evaluate(
                 suite, defences=defences, attacks=attacks, scenarios=scenarios, doses=doses, seeds=seeds, purpose=purpose, batch=batch,
-                workers=workers, out=out, threat=threat, beacon=beacon, progress=progress,
+                workers=workers, out=out, threat=threat, beacon=beacon, progress=progress, metrics=metrics,
             )  # fmt: skip
     base = load_suite(suite) if isinstance(suite, str) else suite if suite is not None else Suite(name="custom")
     defences, attacks = _several(base.defences if defences is None else defences), _several(base.attacks if attacks is None else attacks)
@@ -318,7 +341,8 @@ def evaluate(
     for dose in named.doses:
         if dose is not None and (not isinstance(dose, int) or dose < 0):
             raise InputError("dose", dose, "a whole number of attack steps, not below 0")
-    cells = cells_of(named, batch=batch, purpose=purpose, threat=threat, beacon=beacon)
+    own = tuple(_several(metrics))
+    cells = cells_of(named, batch=batch, purpose=purpose, threat=threat, beacon=beacon, metrics=own)
     rows = run(cells, Path(out) if out is not None else None, workers, progress) if cells else []
     for defence in defences:
         for attack in attacks:
@@ -328,7 +352,7 @@ def evaluate(
             for scenario in named.scenarios:
                 for dose in named.doses:
                     changes = named.threat | dict(threat or {})
-                    cell = Cell(named.name, scenario, dose, *texts, named.seeds, purpose, 0, batch, changes, beacon)
+                    cell = Cell(named.name, scenario, dose, *texts, named.seeds, purpose, 0, batch, changes, beacon, own)
                     rows += run_cell(cell, defence, attack)
     if out is not None and len(rows) > sum(cell.seeds for cell in cells):
         write_atomic(Path(out), packed(rows, Path(out)))  # with the rows of objects

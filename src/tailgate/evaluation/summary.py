@@ -10,12 +10,14 @@ import numpy as np
 from tailgate.evaluation.rows import KEYS
 from tailgate.evaluation.stats import proportion
 
+FIGURES = ("min_gap", "max_error", "rmse_position", "alarm_onsets", "alarm_rate", "attack_steps", "refused_commands")
+
 
 def summarise(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return one entry per cell (the columns of rows.KEYS), in order of appearance; of repeated seeds the last row counts.
 
     crash: share of episodes with a collision in front or behind, with a 95 % Clopper-Pearson interval.
-    Other columns are medians with quartiles.
+    Other columns are medians with quartiles, those of somebody's own metrics too.
     `failed` counts rows with an error; they and skipped pairings are not in the figures.
     """
     groups: dict[tuple[Any, ...], dict[int, dict[str, Any]]] = {}
@@ -35,7 +37,7 @@ def summarise(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         if good:
             share = proportion(sum(bool(r["crashed"]) for r in good), len(good))
             entry["crash"] = {"value": share.value, "low": share.low, "high": share.high}
-            for name in ("min_gap", "max_error", "rmse_position", "alarm_onsets", "alarm_rate", "attack_steps", "refused_commands"):
+            for name in (*FIGURES, *good[0].get("metrics", ())):
                 values = np.array([r[name] for r in good if r[name] is not None], np.float64)
                 if len(values):
                     low, mid, high = np.quantile(values, [0.25, 0.5, 0.75])

@@ -7,17 +7,24 @@ An estimate's error is that of the gap, or the norm of the whole state's error i
 """
 
 from collections.abc import Callable
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import NamedTuple
 
 import numpy as np
 
+from tailgate.base.errors import InputError, unknown
 from tailgate.core import Array, Model
+from tailgate.core.foreign import attribute_of, said
+from tailgate.core.registry import GROUPS
 from tailgate.play.trace import Trace
 
 TTC_CAP = 100.0  # [s]
 RECOVERY_TOLERANCE = 2.0  # [m]
 DETECTION_DEADLINE = 10  # [steps]
 
-METRICS: dict[str, Callable[[Trace], Array]] = {}
+Function = Callable[[Trace], Array]
+METRICS: dict[str, Function] = {}
 UNITS: dict[str, str] = {}  # on a road
 ERRORS = ("rmse_position", "max_error", "final_error")  # norms over states of mixed units if there is no road
 
@@ -27,10 +34,10 @@ def unit_in(name: str, model: Model) -> str:
     return "-" if name in ERRORS and not model.followers.any() else UNITS[name]
 
 
-def metric(unit: str) -> Callable[[Callable[[Trace], Array]], Callable[[Trace], Array]]:
+def metric(unit: str) -> Callable[[Function], Function]:
     """Register a metric under its function's name."""
 
-    def add(function: Callable[[Trace], Array]) -> Callable[[Trace], Array]:
+    def add(function: Function) -> Function:
         METRICS[function.__name__] = function
         UNITS[function.__name__] = unit
         return function
@@ -271,6 +278,65 @@ def attack_steps(trace: Trace) -> Array:
 def refused_commands(trace: Trace) -> Array:
     """Commands that the channel refused."""
     return np.asarray(np.count_nonzero(trace.refused & trace.live, axis=0), np.float64)
+
+
+class Own(NamedTuple):
+    """Somebody's metric: the name of its column, and its function."""
+
+    name: str
+    function: Function
+
+    def __call__(self, trace: Trace) -> Array:
+        """Return the values (B,). Raises InputError for anything else."""
+        values = np.asarray(self.function(trace))
+        if values.shape != (trace.batch,) or values.dtype.kind not in "bif":
+            raise InputError(f"metric {self.name}", f"{values.dtype} {values.shape}", f"numbers of shape ({trace.batch},), one an episode")
+        return _finite(values)
+
+
+def own_metric(text: str) -> Own:
+    """Return the metric of an entry point of the group `tailgate.metrics`, by its name, or the function that is named as module:function.
+
+    Raises
+    ------
+    InputError
+        For what is neither, and for a name that every row has.
+    """
+    if text in METRICS and not METRICS[text].__module__.startswith("tailgate."):
+        return Own(text, METRICS[text])  # registered by `metric`
+    points = _points()
+    if text in points:
+        try:
+            found = Own(text, points[text].load())
+        except Exception as error:  # whatever somebody's package does
+            raise InputError("metric", text, f"an entry point that can be loaded ({said(error)})") from None
+    elif ":" in text:
+        found = Own(text.partition(":")[2], attribute_of("metric", text, _plain_function, "function"))  # type: ignore[arg-type]
+    elif text in METRICS:
+        raise InputError("metric", text, "one of your own: every row has this one")
+    elif points:
+        raise unknown("metric", text, points)
+    else:
+        raise InputError("metric", text, "module:function, or the name of an entry point of the group tailgate.metrics")
+    if not _plain_function(found.function):
+        raise InputError("metric", text, "a function of a trace")
+    if METRICS.get(found.name, found.function) is not found.function:
+        raise InputError("metric", text, "a name that is not taken")
+    return found
+
+
+def own_metrics() -> list[Own]:
+    """Return the metrics of all entry points."""
+    return [own_metric(name) for name in sorted(_points())]
+
+
+def _plain_function(value: object) -> bool:
+    return callable(value) and not isinstance(value, type)
+
+
+@cache
+def _points() -> dict[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=GROUPS["metric"])}
 
 
 def measure(trace: Trace) -> dict[str, Array]:
