@@ -176,19 +176,15 @@ def list_suites() -> list[str]:
 
 
 def load_scenario(name: str) -> Scenario:
-    """Return a scenario by name, or from a YAML file."""
+    """Return a scenario by name, or from a YAML file, which may name another as its `base` and contain only what changes."""
     path = config_path("scenarios", name, "scenario")
-    data = read_yaml(path, "scenario")
     where = f"scenario {path.stem}"
-    for key in data:
-        if key not in fields_of(Scenario):
-            raise unknown(f"{where}: unknown field", key, fields_of(Scenario))
+    data = _read_scenario(path, where)
+    if (base := data.pop("base", None)) is not None:
+        data = _rebased(base, data, path, f"{where}.base")
     for key in (*_COMPONENTS, "horizon"):
         if key not in data:
             raise InputError(f"{where}.{key}", None, "a value; the field is required")
-    manoeuvre = data["manoeuvre"]
-    if isinstance(manoeuvre, dict) and isinstance(manoeuvre.get("path"), str):  # relative to the file that names it
-        data["manoeuvre"] = manoeuvre | {"path": path.parent / manoeuvre["path"]}
     parts = {key: make_from(key, data[key], f"{where}.{key}") for key in _COMPONENTS}  # type: ignore[arg-type]
     threat = data.get("threat_model", {})
     if not isinstance(threat, dict):
@@ -198,6 +194,33 @@ def load_scenario(name: str) -> Scenario:
     scenario = build(Scenario, parts | rest, where)
     _check_truth(scenario.truth, f"{where}.truth")
     return scenario
+
+
+def _read_scenario(path: Path, where: str) -> dict[str, Any]:
+    """Return the fields of a scenario's file; the path of a recording is that from the file."""
+    data = read_yaml(path, "scenario")
+    for key in data:
+        if key not in (*fields_of(Scenario), "base"):
+            raise unknown(f"{where}: unknown field", key, [*fields_of(Scenario), "base"])
+    manoeuvre = data.get("manoeuvre")
+    if isinstance(manoeuvre, dict) and isinstance(manoeuvre.get("path"), str):
+        data["manoeuvre"] = manoeuvre | {"path": path.parent / manoeuvre["path"]}
+    return data
+
+
+def _rebased(base: object, changes: dict[str, Any], path: Path, where: str) -> dict[str, Any]:
+    """Return the fields of a base with changes. A mapping without a `name` changes fields of the base's; everything else replaces it."""
+    if not isinstance(base, str):
+        raise InputError(where, base, "the name or the file of a scenario")
+    file = path.parent / base if base.endswith(YAML_ENDS) else base
+    out = _read_scenario(config_path("scenarios", str(file), where), where)
+    if "base" in out:  # one level, so that nobody looks for a field in many files
+        raise InputError(where, base, "a scenario without a base of its own")
+    out.pop("name", None)
+    for key, new in changes.items():
+        old = {"name": held} if isinstance(held := out.get(key), str) and key in _COMPONENTS else held
+        out[key] = old | new if isinstance(old, dict) and isinstance(new, dict) and "name" not in new else new
+    return out
 
 
 def load_suite(name: str) -> Suite:
