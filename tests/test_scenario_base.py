@@ -1,10 +1,13 @@
-"""A scenario that names another as its base and holds only what changes."""
+"""Scenarios: a base with changes, a mapping, an object."""
 
 import dataclasses
+import json
 from pathlib import Path
 
+import gymnasium
 import pytest
 
+import tailgate
 from tailgate.base.errors import InputError
 from tailgate.core.scenario import load_scenario
 
@@ -67,3 +70,37 @@ def test_what_is_no_base_is_one_clear_error(tmp_path: Path, text: str, words: st
     _made(tmp_path, "n", "base: stop-and-go-v0")
     with pytest.raises(InputError, match=words):
         load_scenario(_made(tmp_path, "m", text))
+
+
+FIELDS = {"base": "gusty-stop-and-go-v0", "controller": {"headway": 2.0}, "horizon": 80}
+
+
+def test_a_scenario_is_a_mapping_an_object_or_a_path_too(tmp_path: Path) -> None:
+    """Environments and `evaluate` take each, and play the same episodes."""
+    file = Path(_made(tmp_path, "custom", json.dumps(FIELDS)))
+    forms = [FIELDS, load_scenario(FIELDS), file, str(file)]
+    rows = [tailgate.evaluate(scenarios=form, defences="kf", attacks="fdi:start_step=10,value=-3", seeds=2) for form in forms]
+    assert len({row["trace_hash"] for some in rows for row in some[:1]}) == 1 and len({row["config_hash"] for some in rows for row in some}) == 1
+    assert [some[0]["scenario"] for some in rows] == ["custom"] * 4 and [bool(some[0]["scenario_file"]) for some in rows] == [False, False, True, True]
+    both = tailgate.evaluate(scenarios=[FIELDS, "stop-and-go-v0"], defences="kf", attacks="none", seeds=1, workers=2)
+    assert [row["scenario"] for row in both] == ["custom", "stop-and-go-v0"] and both[0]["status"] == "ok"
+    seen = []
+    for form in forms:
+        env = gymnasium.make("tailgate:tailgate/CarFollowing-v1", scenario=form, value=-3.0)
+        seen.append(env.reset(seed=0)[0].tolist())
+        if form is FIELDS:
+            assert json.loads(env.spec.to_json())["kwargs"]["scenario"] == FIELDS
+    assert seen == [seen[0]] * 4
+    as_dict = tailgate.parallel_env(scenario=FIELDS, value=-3.0)
+    assert as_dict.reset(seed=0)[0]
+
+
+def test_two_scenarios_of_one_name_are_refused() -> None:
+    with pytest.raises(InputError, match="scenarios: got 'custom'; expected scenarios of different names"):
+        tailgate.evaluate(scenarios=[FIELDS, FIELDS | {"horizon": 60}], defences="kf", attacks="none", seeds=1)
+
+
+@pytest.mark.parametrize("value", [3, None, ["a"], {"horizon": 3}, {"base": "nobody"}, {"headway": 2}])
+def test_what_is_no_scenario_is_one_clear_error(value: object) -> None:
+    with pytest.raises(InputError, match="scenario"):
+        load_scenario(value)  # type: ignore[arg-type]

@@ -14,7 +14,7 @@ from tailgate.base.errors import InputError, UnknownArgument, unknown
 from tailgate.core import Array, Command, Defence, Frame, Kind, View
 from tailgate.core.loop import Loop, LoopState
 from tailgate.core.registry import Spec
-from tailgate.core.scenario import load_scenario
+from tailgate.core.scenario import ScenarioLike, load_scenario
 from tailgate.core.schema import as_data, build, digest, fields_of
 from tailgate.core.threat import ThreatModel
 from tailgate.envs.gym.actions import ActionCodec, ActionSpec
@@ -116,11 +116,12 @@ class Seat:
 
     @classmethod
     def make(
-        cls, scenario: str | None = None, defence: str | Defence | None = None, threat: dict[str, Any] | None = None, **options: Any
-    ) -> Seat:
+        cls, scenario: ScenarioLike | None = None, defence: str | Defence | None = None, threat: dict[str, Any] | None = None,
+        **options: Any,
+    ) -> Seat:  # fmt: skip
         """Return the environment's core.
 
-        scenario: name or YAML file. defence: name (`chi2_kf:eta=15`) or object. threat: changes of the scenario's threat model.
+        scenario: as `load_scenario` takes it. defence: name (`chi2_kf:eta=15`) or object. threat: changes of the scenario's threat model.
 
         options: the fields of ActionSpec and Reward, `knowledge`, and `frames`: how many decisions the observation shows at once. Scenario
         and defence default to those of car following. `reward` may be an object of a subclass of Reward.
@@ -130,8 +131,6 @@ class Seat:
         if threat is not None and not isinstance(threat, dict):
             raise InputError("threat", threat, "a mapping of changes of the threat model")
         threat = dict(threat or {})
-        if not isinstance(scenario, str):
-            raise InputError("scenario", scenario, "the name of a scenario, or of a YAML file")
         if "knowledge" in options:
             threat["knowledge"] = options.pop("knowledge")
         frames = options.pop("frames", 1)

@@ -21,6 +21,7 @@ from tailgate.core import Array, Attack, Command, Defence, Frame, NonNegative, V
 from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import LoopState
 from tailgate.core.registry import Spec, entry_for
+from tailgate.core.scenario import ScenarioLike
 from tailgate.core.schema import as_data, build, digest, fields_of
 from tailgate.core.threat import KNOWLEDGE
 from tailgate.envs.gym.actions import ActionSpec
@@ -96,7 +97,7 @@ class Duel:
 
     @classmethod
     def make(
-        cls, scenario: str | None = None, defence: str | Defence | None = None, menu: dict[str, Any] | Menu | None = None,
+        cls, scenario: ScenarioLike | None = None, defence: str | Defence | None = None, menu: dict[str, Any] | Menu | None = None,
         defender_action: Literal["menu", "box"] = "menu", **arguments: Any,
     ) -> Duel:  # fmt: skip
         """Return a game.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -93,6 +94,9 @@ def _changed(part: T, changes: object, where: str) -> T:
     return build(type(part), held | changes, where) if changes else part
 
 
+ScenarioLike = str | Path | Mapping[str, Any] | Scenario  # what names a scenario, or is one
+
+
 def _check_truth(truth: dict[str, Any], where: str) -> None:
     for key in truth:
         if key not in ("plant", "sensor", "load", *LINK):
@@ -175,11 +179,34 @@ def list_suites() -> list[str]:
     return list(_builtin("suites"))
 
 
-def load_scenario(name: str) -> Scenario:
-    """Return a scenario by name, or from a YAML file, which may name another as its `base` and contain only what changes."""
-    path = config_path("scenarios", name, "scenario")
+def load_scenario(source: ScenarioLike) -> Scenario:
+    """Return a scenario.
+
+    Parameters
+    ----------
+    source
+        A name, a YAML file, or the fields as a mapping; files and mappings may name another scenario as their `base` and contain only what
+        changes. A scenario is returned as it is.
+
+    Raises
+    ------
+    InputError
+        For anything else, and for fields that make no scenario.
+    """
+    if isinstance(source, Scenario):
+        return source
+    if isinstance(source, Mapping):
+        named = source.get("name", "custom")
+        return _made(_checked(dict(source), Path(), f"scenario {named}"), Path(f"{named}.yaml"))
+    if not isinstance(source, str | Path):
+        raise InputError("scenario", source, "a name, a YAML file, a mapping of fields, or an object")
+    path = config_path("scenarios", str(source), "scenario")
+    return _made(_read_scenario(path, f"scenario {path.stem}"), path)
+
+
+def _made(data: dict[str, Any], path: Path) -> Scenario:
+    """Return the scenario of some fields, as they stand in a file of that path."""
     where = f"scenario {path.stem}"
-    data = _read_scenario(path, where)
     if (base := data.pop("base", None)) is not None:
         data = _rebased(base, data, path, f"{where}.base")
     for key in (*_COMPONENTS, "horizon"):
@@ -197,14 +224,18 @@ def load_scenario(name: str) -> Scenario:
 
 
 def _read_scenario(path: Path, where: str) -> dict[str, Any]:
-    """Return the fields of a scenario's file; the path of a recording is that from the file."""
-    data = read_yaml(path, "scenario")
+    """Return the fields of a scenario's file."""
+    return _checked(read_yaml(path, "scenario"), path.parent, where)
+
+
+def _checked(data: dict[str, Any], folder: Path, where: str) -> dict[str, Any]:
+    """Return the fields of a scenario; the path of a recording begins at the folder."""
     for key in data:
         if key not in (*fields_of(Scenario), "base"):
             raise unknown(f"{where}: unknown field", key, [*fields_of(Scenario), "base"])
     manoeuvre = data.get("manoeuvre")
     if isinstance(manoeuvre, dict) and isinstance(manoeuvre.get("path"), str):
-        data["manoeuvre"] = manoeuvre | {"path": path.parent / manoeuvre["path"]}
+        data["manoeuvre"] = manoeuvre | {"path": folder / manoeuvre["path"]}
     return data
 
 

@@ -11,7 +11,7 @@ import copy
 import dataclasses
 import hashlib
 import inspect
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from tailgate.base.reading import YAML_ENDS
 from tailgate.base.version import VERSION
 from tailgate.core import Attack, Defence, Model, draws
 from tailgate.core.registry import Entry, Family, Spec, entry_for, said, text_of
-from tailgate.core.scenario import Scenario, Suite, load_scenario, load_suite
+from tailgate.core.scenario import Scenario, ScenarioLike, Suite, load_scenario, load_suite
 from tailgate.core.schema import as_data, canonical
 from tailgate.core.threat import Brief
 from tailgate.engine.cards import DeviceError, device, playing_on
@@ -58,11 +58,17 @@ class Cell:
     threat: dict[str, Any] = field(default_factory=dict)
     beacon: str = ""
     metrics: tuple[str, ...] = ()  # of somebody's own, as `own_metric` takes them
+    given: Scenario | None = None  # the scenario, where it is an object and `scenario` only its name
 
     @property
     def episodes(self) -> Sequence[int]:
         """Seeds of its episodes: numbers, or those of the round of its beacon."""
         return numbered(self.beacon, self.suite, self.purpose, self.first_seed, self.seeds)
+
+    @property
+    def base(self) -> Scenario:
+        """The scenario at its own dose, with its own threat model."""
+        return load_scenario(self.scenario) if self.given is None else self.given
 
     def place(self, attack: Attack, knowledge: str) -> Scenario:
         """Return the scenario at the cell's dose, with the knowledge that the attack needs."""
@@ -72,7 +78,7 @@ class Cell:
         changes.setdefault("knowledge", getattr(attack, "knowledge", knowledge))
         if getattr(attack, "sees_measurement", False):
             changes["sees_measurement"] = True
-        return load_scenario(self.scenario).with_threat(**changes)
+        return self.base.with_threat(**changes)
 
 
 def component(family: Family, value: object) -> tuple[Any, Entry, str]:
@@ -183,9 +189,9 @@ def failed_rows(cell: Cell, reason: str) -> list[dict[str, Any]]:
 
 def cell_id(cell: Cell) -> str:
     """Return a hash of everything that determines a cell's rows; a finished cell with this id is not played again."""
-    data = dataclasses.asdict(cell)
+    data = dataclasses.asdict(dataclasses.replace(cell, given=None))
     data["sources"] = [Spec("defence", cell.defence).digest, Spec("attack", cell.attack).digest]
-    place = load_scenario(cell.scenario)
+    place = cell.base
     data["scenario"] = place.config_hash
     parts = [place.plant, place.sensor, place.controller, place.manoeuvre]
     data["code"] = [_code(one) for one in (*map(type, parts), *(own_metric(text).function for text in cell.metrics))]
@@ -216,15 +222,18 @@ def _sparing() -> Iterator[None]:
 
 def cells_of(
     suite: Suite, *, batch: int = 256, purpose: str = "report", threat: dict[str, Any] | None = None, beacon: str = "",
-    first_seed: int = 0, metrics: Sequence[str] = (),
+    first_seed: int = 0, metrics: Sequence[str] = (), given: Mapping[str, Scenario] | None = None,
 ) -> list[Cell]:  # fmt: skip
-    """Return the cells of a suite in order, from episode `first_seed` on; raise InputError for anything that does not exist."""
+    """Return the cells of a suite in order, from episode `first_seed` on; raise InputError for anything that does not exist.
+
+    given: scenarios that are objects, by the names that the suite has.
+    """
     if purpose not in draws.PURPOSES:
         raise InputError("purpose", purpose, f"one of {', '.join(draws.PURPOSES)}")
     _ = numbered(beacon, suite.name, purpose, 0, 1)  # checks the beacon
-    changes = suite.granted | dict(threat or {})
+    rest = suite.seeds, purpose, first_seed, batch, suite.granted | dict(threat or {}), beacon, tuple(metrics)
     out = [
-        Cell(suite.name, scenario, dose, defence, attack, suite.seeds, purpose, first_seed, batch, changes, beacon, tuple(metrics))
+        Cell(suite.name, scenario, dose, defence, attack, *rest, (given or {}).get(scenario))
         for scenario in suite.scenarios for dose in suite.doses for defence in suite.defences for attack in suite.attacks
     ]  # fmt: skip
     models: dict[str, Model] = {}
@@ -274,8 +283,20 @@ def _play(cells: Sequence[Cell], workers: int) -> Generator[tuple[int, list[dict
 
 
 def _several(value: Any) -> list[Any]:
-    """Return a list of the value, which may be a single name, number or object."""
-    return list(value) if isinstance(value, Iterable) and not isinstance(value, str) else [value]
+    """Return a list of the value, which may be a single name, number, mapping or object."""
+    return list(value) if isinstance(value, Iterable) and not isinstance(value, str | Mapping) else [value]
+
+
+def _named(scenarios: Sequence[ScenarioLike]) -> dict[str, Scenario | None]:
+    """Return scenarios by name, with the object where one is given; a file is its own name."""
+    out: dict[str, Scenario | None] = {}
+    for one in scenarios:
+        place = None if isinstance(one, str | Path) else load_scenario(one)
+        name = str(one) if place is None else place.name
+        if name in out and place != out[name]:
+            raise InputError("scenarios", name, "scenarios of different names")
+        out[name] = place
+    return out
 
 
 @known_arguments
@@ -284,7 +305,7 @@ def evaluate(
     *,
     defences: Any | Sequence[Any] | None = None,
     attacks: Any | Sequence[Any] | None = None,
-    scenarios: str | Sequence[str] | None = None,
+    scenarios: ScenarioLike | Sequence[ScenarioLike] | None = None,
     doses: int | Sequence[int | None] | None = None,
     seeds: int | None = None,
     purpose: str = "report",
@@ -303,7 +324,8 @@ def evaluate(
     ----------
     suite : name or object; without it, give scenarios, defences and attacks
     defences, attacks : names or objects, one or a list
-    scenarios, doses : one or a list; with seeds, they replace those of the suite
+    scenarios : one or a list: names, YAML files, mappings of fields, or objects
+    doses : one or a list; with scenarios and seeds, they replace those of the suite
     threat : changes of the scenarios' threat models
     beacon : the round that the episodes belong to
     batch, workers : episodes played together, and processes; they change no bit
@@ -327,9 +349,11 @@ def evaluate(
     sizes.check("batch", batch)
     sizes.check("workers", workers)
     sizes.check("seeds", base.seeds if seeds is None else seeds)
+    places = _named(_several(base.scenarios if scenarios is None else scenarios))
+    given = {name: place for name, place in places.items() if place is not None}
     named = dataclasses.replace(
         base,
-        scenarios=tuple(_several(base.scenarios if scenarios is None else scenarios)),
+        scenarios=tuple(places),
         doses=tuple(_several(base.doses if doses is None else doses)),
         defences=tuple(d for d in defences if isinstance(d, str)),
         attacks=tuple(a for a in attacks if isinstance(a, str)),
@@ -342,18 +366,17 @@ def evaluate(
         if dose is not None and (not isinstance(dose, int) or dose < 0):
             raise InputError("dose", dose, "a whole number of attack steps, not below 0")
     own = tuple(_several(metrics))
-    cells = cells_of(named, batch=batch, purpose=purpose, threat=threat, beacon=beacon, metrics=own)
+    cells = cells_of(named, batch=batch, purpose=purpose, threat=threat, beacon=beacon, metrics=own, given=given)
     rows = run(cells, Path(out) if out is not None else None, workers, progress) if cells else []
     for defence in defences:
         for attack in attacks:
             if isinstance(defence, str) and isinstance(attack, str):
                 continue
-            texts = component("defence", defence)[2], component("attack", attack)[2]
+            guard, adversary = component("defence", defence)[2], component("attack", attack)[2]
             for scenario in named.scenarios:
                 for dose in named.doses:
-                    changes = named.threat | dict(threat or {})
-                    cell = Cell(named.name, scenario, dose, *texts, named.seeds, purpose, 0, batch, changes, beacon, own)
-                    rows += run_cell(cell, defence, attack)
+                    rest = named.seeds, purpose, 0, batch, named.threat | dict(threat or {}), beacon, own, given.get(scenario)
+                    rows += run_cell(Cell(named.name, scenario, dose, guard, adversary, *rest), defence, attack)
     if out is not None and len(rows) > sum(cell.seeds for cell in cells):
         write_atomic(Path(out), packed(rows, Path(out)))  # with the rows of objects
     return Rows(rows)
