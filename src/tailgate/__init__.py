@@ -1,6 +1,7 @@
 """Tailgate: defences for adaptive cruise control, scored against an adversary that learns when to attack.
 
 `evaluate` plays defences against attacks and returns a row per episode; `make_defence`, `make_attack` and the lists give components.
+`plot` draws rows and traces.
 
 Example::
 
@@ -11,6 +12,7 @@ Example::
     rows = tailgate.evaluate(scenarios="stop-and-go-v0", defences="chi2_kf", attacks="none", seeds=2)
 """
 
+from importlib import import_module
 from typing import Any
 
 from tailgate import moved as moved
@@ -45,12 +47,16 @@ def list_attacks() -> list[str]:
     return list(entries("attack"))
 
 
-__getattr__, _ = exported(__name__, {"estimators": "per_episode", "evaluation.cells": "evaluate", "envs.gym.parallel": "parallel_env"})
+_get, _ = exported(__name__, {"estimators": "per_episode", "evaluation.cells": "evaluate", "envs.gym.parallel": "parallel_env"})
+
+
+def __getattr__(name: str) -> Any:
+    return import_module("tailgate.plot") if name == "plot" else _get(name)
 
 
 def __dir__() -> list[str]:
-    """Return the names of the package, with functions that are imported on first use: `help(tailgate)` lists them."""
-    return sorted({*globals(), "evaluate", "per_episode"})
+    """Return the names of the package, with those that are imported on first use: `help(tailgate)` lists them."""
+    return sorted({*globals(), "evaluate", "per_episode", "plot"})
 
 
 def _register() -> None:

@@ -56,11 +56,12 @@ def write_overview(table: Table, directory: Path) -> list[Path]:
         here = [e for e in good if (e["scenario"], e["dose"]) == (scenario, dose)]
         name = re.sub(r"[^\w.-]+", "-", f"{scenario}-{'unlimited' if dose is None else dose}.png")
         out.append(directory / name)
-        write_atomic(out[-1], matrices(here, f"{scenario}, budget {'unlimited' if dose is None else f'{dose} steps'}"))
+        title = f"{scenario}, budget {'unlimited' if dose is None else f'{dose} steps'}"
+        write_atomic(out[-1], png(matrix_figure(here, title)))
     road = [entry for entry in good if entry["min_gap"]]
     if road:
         out.append(directory / "rmse-against-gap.png")
-        write_atomic(out[-1], scatter(road))
+        write_atomic(out[-1], png(scatter_figure(road)))
     return out
 
 
@@ -71,8 +72,8 @@ def value(entry: dict[str, Any], key: str) -> float:
     return float(entry[key]["median"]) if entry[key] else float("nan")
 
 
-def matrices(table: Table, title: str) -> bytes:
-    """Draw matrices of defences by attacks: position error, smallest gap, collisions; without a road, state errors."""
+def matrix_figure(table: Table, title: str) -> Figure:
+    """Return matrices of defences by attacks: position error, smallest gap, collisions; without a road, state errors."""
     panels = PANELS if any(entry["min_gap"] for entry in table) else NO_ROAD
     defences, attacks = (list(dict.fromkeys(e[key] for e in table)) for key in ("defence", "attack"))
     labels = [textwrap.fill(name.replace(",", ", "), 26) for name in attacks]
@@ -95,15 +96,15 @@ def matrices(table: Table, title: str) -> bytes:
         ax.set_xticks(range(len(attacks)), labels, rotation=90, fontsize=7)
         ax.set_yticks(range(len(defences)), defences, fontsize=8)
     figure.suptitle(title)
-    return png(figure)
+    return figure
 
 
 def _short(number: float) -> str:
     return f"{number:.0f}" if abs(number) >= 9.95 else f"{number:.1f}" if abs(number) >= 0.05 else "0"
 
 
-def scatter(table: Table) -> bytes:
-    """Draw position error against smallest gap, one mark per cell; filled marks are cells where most episodes collide."""
+def scatter_figure(table: Table) -> Figure:
+    """Return position error against smallest gap, one mark per cell; filled marks are cells where most episodes collide."""
     figure, axes = canvas(10.0, 5.8)
     ax, defences = axes[0, 0], list(dict.fromkeys(e["defence"] for e in table))
     for i, name in enumerate(defences):
@@ -122,7 +123,7 @@ def scatter(table: Table) -> bytes:
     ax.set_title(f"Error against gap: rank correlation {_rank_correlation(table):+.2f}\nfilled: most episodes collide", fontsize=10)
     ax.grid(alpha=0.3, which="both")
     figure.legend(loc="outside lower center", fontsize=8, ncols=3)
-    return png(figure)
+    return figure
 
 
 def _rank_correlation(table: Table) -> float:

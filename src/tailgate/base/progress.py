@@ -4,11 +4,23 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 Update = Callable[[str, int, int, str], None]  # label, done, total, figures
+_silent: ContextVar[bool] = ContextVar("silent", default=False)
+
+
+@contextmanager
+def silent() -> Iterator[None]:
+    """Show no progress within a block."""
+    token = _silent.set(True)
+    try:
+        yield
+    finally:
+        _silent.reset(token)
 
 
 @contextmanager
@@ -17,6 +29,9 @@ def progress(shown_on: Console) -> Iterator[Update]:
 
     Lines have the time since the label's first update, and from a minute on the time left at the pace since then.
     """
+    if _silent.get():
+        yield lambda *_: None
+        return
     if not shown_on.is_terminal:
         shown: dict[str, int] = {}
         begun: dict[str, tuple[float, int]] = {}

@@ -18,6 +18,8 @@ import tailgate
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, Killed
 from tailgate.base.interrupts import Ending, orderly
+from tailgate.base.progress import silent
+from tailgate.cli.completion import complete
 
 EXIT_INPUT = 2
 CHOICE, OPTION = 0.6, 0.75  # likeness from which a name is suggested; options have their dashes in common
@@ -29,6 +31,7 @@ COMMANDS = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code: 0 done, 1 a component failed, 2 bad input, 130 interrupted, 143 terminated."""
+    complete(_parser)
     chosen = argparse.Namespace()
     sizes.tell = lambda text: print(f"tailgate: {text}", file=sys.stderr)
     with orderly(lambda: _kept(chosen)) as ending:
@@ -64,6 +67,8 @@ def _place(chosen: argparse.Namespace) -> Iterator[None]:
     if address is not None and engine != "ray":
         raise InputError("--address", address, "--engine ray with it")
     with ExitStack() as stack:
+        if getattr(chosen, "quiet", False):
+            stack.enter_context(silent())
         if getattr(chosen, "device", "cpu") != "cpu":
             from tailgate.engine.cards import playing_on
 
@@ -84,6 +89,10 @@ class _Parser(argparse.ArgumentParser):
     """Says in one line what is wrong with the arguments, and which --help explains it; argparse shows the whole usage."""
 
     given: tuple[str, ...] = ()
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.add_argument("--quiet", action="store_true", default=argparse.SUPPRESS, help="show no progress")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         self.given = tuple(map(str, sys.argv[1:] if args is None else args))
