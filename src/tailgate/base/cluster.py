@@ -13,6 +13,7 @@ import socket
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
+from types import ModuleType
 from typing import Any, NamedTuple
 
 from tailgate.base import sizes, sources
@@ -39,7 +40,7 @@ class RayCrew:
     A job whose worker or node is lost is given again, RETRIES times; then its answer is that it died.
     """
 
-    def __init__(self, ray: Any, most: int) -> None:
+    def __init__(self, ray: ModuleType, most: int) -> None:
         self.ray, self.most = ray, most
         self._given: dict[Any, _Given] = {}
         self._done = ray.remote(num_cpus=1, max_retries=0)(_done)
@@ -79,7 +80,7 @@ class RayCrew:
             found += [one for task in ready if (one := self._answer(task, self._given.pop(task))) is not None]
         return found
 
-    def _answer(self, task: Any, given: _Given) -> Answer | None:
+    def _answer(self, task: object, given: _Given) -> Answer | None:
         errors = self.ray.exceptions
         try:
             word, value = self.ray.get(task)

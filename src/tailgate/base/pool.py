@@ -170,7 +170,7 @@ class Crew:
         return found
 
 
-def answer(job: int, word: Any, value: Any) -> Answer:
+def answer(job: int, word: Literal["said", "done", "failed", "died"], value: Any) -> Answer:
     """Return the answer to a job; an error has the worker's traceback as its cause."""
     if word == "failed":
         value, text = value

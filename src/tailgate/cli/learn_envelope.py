@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from tailgate.base.errors import InputError
 from tailgate.cli.shared import Commands, counted, print_json, say, table, working
@@ -41,12 +40,10 @@ def _learn(options: argparse.Namespace) -> int:
     from tailgate.studies.envelope_sources import from_log, from_scenarios
 
     rate = options.rate if options.rate is not None else 0.05 if options.unit == "episode" else 1e-4
-    margin: Any = options.margin
-    if margin != "gpd":
-        try:
-            margin = float(margin)
-        except ValueError:
-            raise InputError("--margin", margin, "gpd, or a share of the half width, such as 0.1") from None
+    try:
+        margin = options.margin if options.margin == "gpd" else float(options.margin)
+    except ValueError:
+        raise InputError("--margin", options.margin, "gpd, or a share of the half width, such as 0.1") from None
     settings, out = Settings(margin, options.tail, rate, options.unit, options.positions), Path(options.out)
     if out.suffix != ".json":
         raise InputError("--out", options.out, "a path that ends with .json")

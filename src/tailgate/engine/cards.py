@@ -41,10 +41,10 @@ class Card(Protocol):
     def loaded(self, code: bytes, kernels: Sequence[str]) -> dict[str, Any]:
         """Return the kernels of machine code."""
 
-    def at_once(self, kernel: Any, threads: int) -> int:
+    def at_once(self, kernel: object, threads: int) -> int:
         """Return how many warps of a kernel run at once, in blocks of a number of threads."""
 
-    def facts(self, kernel: Any) -> dict[str, int]:
+    def facts(self, kernel: object) -> dict[str, int]:
         """Return a kernel's `registers`, and the bytes of a thread's `local` memory, spilled registers among them."""
 
     def wait(self) -> None:
@@ -53,7 +53,7 @@ class Card(Protocol):
     def copy(self, to: int, at: int, size: int) -> None:
         """Begin a copy from one place on the card to another."""
 
-    def launch(self, kernel: Any, grid: int, threads: int, arguments: Sequence[Argument]) -> None:
+    def launch(self, kernel: object, grid: int, threads: int, arguments: Sequence[Argument]) -> None:
         """Begin a kernel; it runs after all work before it."""
 
     def taken(self, size: int) -> int:

@@ -24,7 +24,7 @@ def _refused(expected: str) -> DeviceError:
     return DeviceError("device", "cuda", expected)
 
 
-def _name(code: Any) -> str:
+def _name(code: object) -> str:
     return str(getattr(code, "name", code))
 
 
@@ -115,13 +115,13 @@ class Nvidia:
         module = _ok(driver.cuModuleLoadData(code))
         return {name: _ok(driver.cuModuleGetFunction(module, name.encode())) for name in kernels}
 
-    def at_once(self, kernel: Any, threads: int) -> int:
+    def at_once(self, kernel: object, threads: int) -> int:
         """Return how many warps of a kernel run at once."""
         self._here()
         blocks = int(_ok(driver.cuOccupancyMaxActiveBlocksPerMultiprocessor(kernel, threads, 0)))
         return max(1, self._processors * blocks * threads // 32)
 
-    def facts(self, kernel: Any) -> dict[str, int]:
+    def facts(self, kernel: object) -> dict[str, int]:
         """Return a kernel's `registers`, and the bytes of a thread's `local` memory, spilled registers among them."""
         self._here()
         part = driver.CUfunction_attribute
@@ -138,7 +138,7 @@ class Nvidia:
         self._here()
         self._wait()
 
-    def launch(self, kernel: Any, grid: int, threads: int, arguments: Sequence[Argument]) -> None:
+    def launch(self, kernel: object, grid: int, threads: int, arguments: Sequence[Argument]) -> None:
         """Begin a kernel; it runs after all work before it."""
         self._here()
         held = [argument if isinstance(argument, np.ndarray) else np.array([argument], np.int64) for argument in arguments]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -60,7 +60,7 @@ class Code:
 class CudaProgram(Program):
     """The kernels of a trace."""
 
-    def __init__(self, trace: Trace, lanes: int | None = None, least: int = LEAST, twins: Any = None) -> None:
+    def __init__(self, trace: Trace, lanes: int | None = None, least: int = LEAST, twins: Mapping[str, str] | None = None) -> None:
         """Compile a trace, see `Program`; the lanes are those of a warp."""
         self.card = card()
         super().__init__(trace, LANES, least, twins)

@@ -35,7 +35,7 @@ from tailgate.evaluation.frame import Rows
 from tailgate.evaluation.resume import complete
 from tailgate.evaluation.rounds import numbered
 from tailgate.evaluation.rows import packed
-from tailgate.play.metrics import METRICS, Own, measure, own_metric
+from tailgate.play.metrics import METRICS, Function, Own, measure, own_metric
 from tailgate.play.trace import Trace, episode_memory, episodes_at_once, rollout
 
 ENGINE = "plain"
@@ -193,12 +193,12 @@ def cell_id(cell: Cell) -> str:
     data["sources"] = [Spec("defence", cell.defence).digest, Spec("attack", cell.attack).digest]
     place = cell.base
     data["scenario"] = place.config_hash
-    parts = [place.plant, place.sensor, place.controller, place.manoeuvre]
-    data["code"] = [_code(one) for one in (*map(type, parts), *(own_metric(text).function for text in cell.metrics))]
+    parts: list[type | Function] = [type(part) for part in (place.plant, place.sensor, place.controller, place.manoeuvre)]
+    data["code"] = [_code(one) for one in (*parts, *(own_metric(text).function for text in cell.metrics))]
     return hashlib.blake2b(f"{VERSION}/{sources.own()}/{canonical(data)}".encode(), digest_size=12).hexdigest()
 
 
-def _code(value: Any) -> str:
+def _code(value: type | Function) -> str:
     """Return the hash of the file that defines somebody's class or function; empty for one of this package, or without a file."""
     if value.__module__.partition(".")[0] == "tailgate":
         return ""
@@ -282,7 +282,7 @@ def _play(cells: Sequence[Cell], workers: int) -> Generator[tuple[int, list[dict
     )
 
 
-def _several(value: Any) -> list[Any]:
+def _several(value: object) -> list[Any]:
     """Return a list of the value, which may be a single name, number, mapping or object."""
     return list(value) if isinstance(value, Iterable) and not isinstance(value, str | Mapping) else [value]
 
@@ -303,8 +303,8 @@ def _named(scenarios: Sequence[ScenarioLike]) -> dict[str, Scenario | None]:
 def evaluate(
     suite: str | Suite | None = None,
     *,
-    defences: Any | Sequence[Any] | None = None,
-    attacks: Any | Sequence[Any] | None = None,
+    defences: object | Sequence[object] | None = None,
+    attacks: object | Sequence[object] | None = None,
     scenarios: ScenarioLike | Sequence[ScenarioLike] | None = None,
     doses: int | Sequence[int | None] | None = None,
     seeds: int | None = None,

@@ -10,7 +10,7 @@ import numpy as np
 
 from tailgate.base.errors import InputError, unknown
 from tailgate.base.reading import load_json
-from tailgate.core import Array, draws
+from tailgate.core import Array, Attack, draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import list_scenarios, list_suites
 from tailgate.falsify.case import PURPOSE, Case
@@ -32,7 +32,7 @@ def _rows(numbers: Numbers, batch: int) -> Numbers:
     return {key: np.repeat(held, batch, axis=0) for key, held in numbers.items()}
 
 
-def _played(case: Case, attack: Any, text: str, seed: int, numbers: Numbers, batch: int = 1, plain: bool = True) -> Trace:
+def _played(case: Case, attack: Attack, text: str, seed: int, numbers: Numbers, batch: int = 1, plain: bool = True) -> Trace:
     keys = Steered.of(draws.keys(PURPOSE, [seed] * batch), _rows(numbers, batch))
     return rollout(case.loop(text), attack, keys, plain=plain)
 

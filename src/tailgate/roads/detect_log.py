@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -25,6 +25,9 @@ from tailgate.evaluation.stats import mean_time
 from tailgate.play.trace import Trace, rollout
 from tailgate.roads.recording import Recording
 from tailgate.roads.replayed import Cut, Noise, cut, loop_over, process_var, rows
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 SETTLING = 5.0  # of a filter, in which alarms do not count [s]
 WINDOW = 60.0  # of a piece that is attacked [s]
@@ -256,7 +259,7 @@ def draw(played: Played) -> bytes:
     return png(figure)
 
 
-def _shade(ax: Any, t: Array, on: Array, colour: str, label: str) -> None:
+def _shade(ax: Axes, t: Array, on: Array, colour: str, label: str) -> None:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(int), [0]])))
     for j, (a, b) in enumerate(zip(edges[::2], edges[1::2], strict=True)):
         ax.axvspan(t[a], t[min(b, len(t) - 1)], color=colour, alpha=0.25, label=label if j == 0 else None)

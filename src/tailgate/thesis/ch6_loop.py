@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -122,7 +121,7 @@ def _zero_mean(safe: Safe, seeds: int) -> Claim:
 class Untold(Platoon):
     """The platoon in which no filter knows any command, the leader's own included."""
 
-    def known(self, plan: Any, u: Array, exo: Array, state: Any) -> Array:
+    def known(self, plan: object, u: Array, exo: Array, state: object) -> Array:
         return num.zeros(u.shape)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
@@ -22,7 +22,7 @@ STYLES = (("-", "o"), ("--", "s"), (":", "^"))  # distinct without colour as wel
 BAND = "#F0C000"
 
 
-def panel(ax: Axes, legend: int | None = 8, grid: Literal["major", "both"] = "major", **labels: Any) -> None:
+def panel(ax: Axes, legend: int | None = 8, grid: Literal["major", "both"] = "major", **labels: object) -> None:
     """Label an axis of matplotlib, and give it a grid and a legend of this font size (None: no legend)."""
     ax.set(**labels)
     ax.grid(alpha=0.3, which=grid)

@@ -11,13 +11,14 @@ F, H and u0 are read off the controller by probing it, as is the range within wh
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 
 from tailgate.base.errors import InputError, NotApplicable
-from tailgate.core import Array, Estimate, Model
+from tailgate.core import Array, Controller, Estimate, Model
 from tailgate.core.scenario import Scenario
 from tailgate.core.threat import Brief
 from tailgate.envs.controllers.adaptive_cruise import LEADER
@@ -78,7 +79,7 @@ class AffineLoop:
     uniform: bool = False  # the readings' noise is uniform: its generators hold all of it
 
 
-def probed(controller: Any, model: Model) -> Law:
+def probed(controller: Controller, model: Model) -> Law:
     """Return the linear form of a controller, by probing it.
 
     Raises
@@ -118,7 +119,7 @@ def probed(controller: Any, model: Model) -> Law:
     return Law(rows[:, :n], rows[:, n:], u0, low, high)
 
 
-def _inside(told: Any, zero: Array, n: int, low: Array, high: Array) -> Array:
+def _inside(told: Callable[[Array, Array], Array], zero: Array, n: int, low: Array, high: Array) -> Array:
     """Return a point (1, n + p) at which the command lies well between its limits."""
     rng = np.linspace(-1.0, 1.0, 41)
     for size in (0.0, 1.0, 10.0, 100.0, 1000.0):
@@ -207,6 +208,16 @@ def outside_of(place: Scenario, model: Model, delay: int, stale: bool, lead: tup
 def injectable(brief: Brief) -> Array:
     """Return (w,) bool: the wires of agent 0 that false data may be injected on, granted and not authenticated."""
     return np.asarray(brief.granted[0] & ~brief.sealed)
+
+
+class LoopOptions(TypedDict, total=False):
+    """Arguments of `affine_loop` that others pass on."""
+
+    at_rest: bool
+    spread: float
+    stale: bool
+    lead: tuple[float, float] | None
+    steps: int | None
 
 
 def affine_loop(

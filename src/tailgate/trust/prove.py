@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from tailgate.core import Array
 from tailgate.core.scenario import Scenario, load_scenario
 from tailgate.envs.controllers.adaptive_cruise import LEADER
 from tailgate.envs.plants.highway import Highway
-from tailgate.trust.affine import affine_loop, injectable
+from tailgate.trust.affine import LoopOptions, affine_loop, injectable
 from tailgate.trust.leaders import accelerations
 from tailgate.trust.signals import SafeDistance
 from tailgate.trust.tube import Tube
@@ -82,7 +82,7 @@ def closed_form(place: Scenario, speeds: Sequence[float] = SPEEDS) -> dict[str, 
     }  # fmt: skip
 
 
-def attack_size(place: Scenario, bound: float | None, alpha: float | None, **options: Any) -> dict[str, Any]:
+def attack_size(place: Scenario, bound: float | None, alpha: float | None, **options: Unpack[LoopOptions]) -> dict[str, Any]:
     """Return the largest injected value that is proved safe, with the limits of the command and without them."""
     tube = Tube(affine_loop(place, bound=bound, **options), bound, alpha)
     most, calm = place.threat_model.fdi_bound, tube.under(0.0)
@@ -95,7 +95,9 @@ def attack_size(place: Scenario, bound: float | None, alpha: float | None, **opt
     }  # fmt: skip
 
 
-def message_delay(place: Scenario, size: float, alpha: float | None, tell: Tell | None = None, **options: Any) -> dict[str, Any]:
+def message_delay(
+    place: Scenario, size: float, alpha: float | None, tell: Tell | None = None, **options: Unpack[LoopOptions]
+) -> dict[str, Any]:  # fmt: skip
     """Return the largest delay of the leader's message [steps] up to which no gap is lost, every shorter one included.
 
     Raises
@@ -119,7 +121,7 @@ def message_delay(place: Scenario, size: float, alpha: float | None, tell: Tell 
 
 def prove(
     scenario: str, bound: float | None = None, alpha: float | None = None, threat: dict[str, Any] | None = None, set_speed: bool = True,
-    delays: bool = False, tell: Tell | None = None, **options: Any,
+    delays: bool = False, tell: Tell | None = None, **options: Unpack[LoopOptions],
 ) -> dict[str, Any]:  # fmt: skip
     """Return the report on a scenario under the defence `kf`.
 
