@@ -21,7 +21,8 @@ import tailgate
 from tailgate.base.errors import InputError, NotApplicable, unknown
 from tailgate.base.lazy import components
 from tailgate.core import Positive, param, registry
-from tailgate.core.registry import Entry, Spec, entries, find, make_from, put, register, said
+from tailgate.core.foreign import with_place
+from tailgate.core.registry import Entry, Spec, entries, find, make_from, put, register
 from tailgate.core.schema import as_data, build, canonical, override, read_yaml, scalar
 from tailgate.estimators import GatedKalman, Kalman
 from tailgate.training.selfplay import GameConfig
@@ -341,7 +342,7 @@ def test_an_error_names_the_last_line_of_its_users_own_file(name, line, tmp_path
     defence = Spec("defence", f"foreign_lines:{name}").make()
     with pytest.raises(ValueError) as caught:
         defence.step(None, None, None, None, None)
-    assert said(caught.value).endswith(f"(foreign_lines.py, line {line})")
+    assert with_place(caught.value).endswith(f"(foreign_lines.py, line {line})")
 
 
 @pytest.mark.parametrize(("name", "line"), [("Early", 20), ("Plain", 24)])

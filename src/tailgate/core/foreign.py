@@ -14,7 +14,7 @@ from tailgate.base.errors import InputError, unknown
 SHOWN = 12  # classes that an error names, at most
 
 
-def said(error: Exception) -> str:
+def with_place(error: Exception) -> str:
     """Return an error of somebody's code in a line: its type, its words, and the last line of that code on the way to it.
 
     Compiled code is left out, as its files cannot be read.
@@ -49,7 +49,7 @@ def attribute_of(family: str, text: str, fits: Callable[[object], bool], kind: s
     except SyntaxError as error:
         raise InputError(family, text, f"a module without syntax errors ({error.msg}, line {error.lineno})") from None
     except Exception as error:  # whatever its first lines do
-        raise InputError(family, text, f"a module that can be imported ({said(error)})") from None
+        raise InputError(family, text, f"a module that can be imported ({with_place(error)})") from None
     if found is None:
         own = sorted(key for key, value in vars(held).items() if fits(value) and getattr(value, "__module__", "") == module)
         shown = ", ".join(own[:SHOWN]) + (f" and {len(own) - SHOWN} more" if len(own) > SHOWN else "")

@@ -18,8 +18,7 @@ from typing import Any, Literal, TypedDict, TypeVar, Unpack
 
 from tailgate.base.errors import InputError, unknown
 from tailgate.base.lazy import components, loaded
-from tailgate.core.foreign import class_of, unregistered
-from tailgate.core.foreign import said as said
+from tailgate.core.foreign import class_of, unregistered, with_place
 from tailgate.core.schema import as_data, build, fields_of, scalar
 from tailgate.core.spec_text import put_in, split_items, split_text
 
@@ -330,7 +329,7 @@ class Spec:
         except Exception as error:
             if isinstance(error, InputError) or self.entry.built_in:
                 raise
-            raise InputError(self.family, self.text, f"a class that can be made ({said(error)})") from None
+            raise InputError(self.family, self.text, f"a class that can be made ({with_place(error)})") from None
         steps = {"defence": ("prepare", "start", "step"), "attack": ("prepare", "start", "decide")}.get(self.family, ())
         if not all(callable(getattr(made, name, None)) for name in steps):
             raise InputError(self.family, self.text, f"a class with {', '.join(steps)}")

@@ -25,7 +25,8 @@ from tailgate.base.pool import apart, each
 from tailgate.base.reading import YAML_ENDS
 from tailgate.base.version import VERSION
 from tailgate.core import Attack, Defence, Model, draws
-from tailgate.core.registry import Entry, Family, Spec, entry_for, said, text_of
+from tailgate.core.foreign import with_place
+from tailgate.core.registry import Entry, Family, Spec, entry_for, text_of
 from tailgate.core.scenario import Scenario, ScenarioLike, Suite, load_scenario, load_suite
 from tailgate.core.schema import as_data, canonical
 from tailgate.core.threat import Brief
@@ -136,7 +137,7 @@ def _why(error: Exception, seeds: Sequence[int] = ()) -> tuple[str, str]:
     if isinstance(error, NotApplicable):
         return str(error), "skipped"
     row = error.row if isinstance(error, InputError) else None
-    return said(error) + (f" (row {row}: seed {seeds[row]})" if row is not None and row < len(seeds) else ""), "error"
+    return with_place(error) + (f" (row {row}: seed {seeds[row]})" if row is not None and row < len(seeds) else ""), "error"
 
 
 def _head(cell: Cell, place: Scenario, defence: Entry, attack: Entry, identity: str) -> dict[str, Any]:

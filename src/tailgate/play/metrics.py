@@ -15,7 +15,7 @@ import numpy as np
 
 from tailgate.base.errors import InputError, unknown
 from tailgate.core import Array, Model
-from tailgate.core.foreign import attribute_of, said
+from tailgate.core.foreign import attribute_of, with_place
 from tailgate.core.registry import GROUPS
 from tailgate.play.trace import Trace
 
@@ -309,7 +309,7 @@ def own_metric(text: str) -> Own:
         try:
             found = Own(text, points[text].load())
         except Exception as error:  # whatever somebody's package does
-            raise InputError("metric", text, f"an entry point that can be loaded ({said(error)})") from None
+            raise InputError("metric", text, f"an entry point that can be loaded ({with_place(error)})") from None
     elif ":" in text:
         found = Own(text.partition(":")[2], attribute_of("metric", text, _plain_function, "function"))  # type: ignore[arg-type]
     elif text in METRICS:
