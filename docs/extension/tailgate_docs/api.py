@@ -11,7 +11,7 @@ from sphinx.util.inspect import stringify_signature
 from .docstrings import escaped, markdown, summary
 
 PACKAGES = (
-    "tailgate", "tailgate.core", "tailgate.envs", "tailgate.envs.torch", "tailgate.estimators", "tailgate.agents", "tailgate.evaluation",
+    "tailgate", "tailgate.core", "tailgate.envs", "tailgate.envs.torch", "tailgate.estimators", "tailgate.agents", "tailgate.evaluation", "tailgate.plot",
     "tailgate.board", "tailgate.sandbox", "tailgate.thesis", "tailgate.cli",
 )  # fmt: skip
 MODULES = ("tailgate.num",)  # without __all__, and yet what components are written with
