@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -172,11 +172,14 @@ def _share(tell: Tell, number: int, members: int) -> Tell:
     return lambda done, total, text, mean: tell(100 * (number * total + done) // (members * total), 100, text, mean)
 
 
-def harvest(hunt: Hunt) -> list[Harvest]:
-    """Let every member search that is asked for; return what each found. `hunt.tell` is called with the share of the whole search."""
-    out, tell = [], hunt.tell
+def harvest(hunt: Hunt, before: Sequence[Harvest] = (), after: Callable[[list[Harvest]], None] | None = None) -> list[Harvest]:
+    """Let every member search that is asked for; return what each found. `hunt.tell` is called with the share of the whole search.
+
+    before: what the first members have found already; after: called behind each member with what is found by then.
+    """
+    out, tell = list(before), hunt.tell
     searching = [one for one in MEMBERS if not hunt.only or one.name in hunt.only]
-    for number, member in enumerate(searching):
+    for number, member in enumerate(searching[len(out) :], len(out)):
         hunt.tell = None if tell is None else _share(tell, number, len(searching))
         found, why = [], ""
         try:
@@ -186,4 +189,6 @@ def harvest(hunt: Hunt) -> list[Harvest]:
             why = str(error)
         hunt.found[member.name] = found
         out.append(Harvest(member.name, member.knowledge, found, why))
+        if after is not None:
+            after(out)
     return out

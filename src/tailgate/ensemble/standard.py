@@ -25,6 +25,7 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_scenario
 from tailgate.core.schema import digest
 from tailgate.core.spec_text import MARKS
+from tailgate.ensemble import journal
 from tailgate.ensemble.gradient import gradient_masking
 from tailgate.ensemble.members import BUDGETS, MEMBERS, Harvest, Hunt, harvest
 from tailgate.ensemble.search import FINAL, Arena, Found
@@ -109,11 +110,13 @@ def expected(jobs: Sequence[Job], workers: int) -> float:
 def search(job: Job, folder: Path, tell: Callable[[int, int, str, float], None] | None = None) -> dict[str, Any]:
     """Run one search; return what every member found, and the best attack that the suite lists, on the same select episodes.
 
-    folder: where files of attacks are written.
+    folder: where files of attacks are written, and a journal: an interrupted search goes on behind the last member that was done.
     """
     arena = job.arena
     hunt = Hunt(arena, BUDGETS[job.budget], job.seed, folder / "attacks" / job.name, tell, () if job.whole else UNLEARNED)
-    found = {one.member: one for one in harvest(hunt)}
+    notes = _file(job, folder).with_suffix(".journal")
+    found = {one.member: one for one in harvest(hunt, journal.resume(notes, hunt), lambda out: journal.write(notes, hunt, out))}
+    notes.unlink(missing_ok=True)
     members = [found.get(one.name, Harvest(one.name, one.knowledge, [], ELSEWHERE)) for one in MEMBERS]
     return {
         "scenario": arena.name, "place": arena.scenario, "dose": arena.dose, "listed": _strongest(arena, job.listed),
