@@ -108,6 +108,7 @@ def test_what_an_older_version_could_not_have_is_played(bare: Data, detected: Da
         check_detection(old, defences=["none"])
 
 
+@pytest.mark.long
 def test_false_alarms_alone_are_added_where_a_board_lacks_them(detected: Data, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of thresholds that stand there; nothing is calibrated again, and a check asks an older board for none."""
     old = copy.deepcopy(detected)

@@ -111,7 +111,7 @@ NETWORKS = [
 ]
 
 
-@pytest.mark.thin(14)
+@pytest.mark.thin(21)
 @pytest.mark.parametrize(("scenario", "defence", "attack", "threat"), PLATOONS + NETWORKS)
 def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack, threat):
     many = {"onset": 10, "end": 80} if scenario in (RESTLESS, WEAK, NOISY, LARGE, THESIS, "network-weak-v0") else {}
