@@ -12,7 +12,10 @@ docs: $(VENV)/.docs  ## the documentation as a site, boards and replays with it:
 	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet --jobs 2 --doctree-dir build/doctrees docs site
 	@echo 'site/index.html'
 
-test: $(VENV)/.ready lint  ## lint, types, tests
+test test-long: export OPENBLAS_NUM_THREADS = 1
+test test-long: export OMP_NUM_THREADS = 1
+
+test: $(VENV)/.ready lint  ## lint, types, tests; a thread in each of two processes
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 test-long: $(VENV)/.docs lint  ## and the tests that take a minute each, as before a release
