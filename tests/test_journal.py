@@ -53,6 +53,24 @@ def test_an_interrupted_search_goes_on(job: standard.Job, tmp_path: Path, monkey
     assert not list(tmp_path.glob("*/searches/*.journal"))
 
 
+def test_nobody_searches_behind_an_attack_that_damages_every_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those who know as much or more are passed over, with the reason; those who know less are not."""
+    from tailgate.ensemble.search import Found
+
+    def finds(name: str, knowledge: str, damage: float) -> members.Member:
+        return members.Member(name, knowledge, lambda hunt: [f"{name}/{damage}"])
+
+    class Place:
+        def best(self, texts: list[str]) -> list[Found]:
+            return [Found(text, float(text.partition("/")[2]), 0.0, 1) for text in texts]
+
+    team = [finds("white", "white", 1.0), finds("some", "black", 0.99), finds("all", "black", 1.0), finds("more", "black", 0.5), finds("grey", "grey", 1.0)]
+    monkeypatch.setattr(members, "MEMBERS", tuple(team))
+    out = members.harvest(Hunt(Place(), members.BUDGETS["quick"], 0, Path()))  # type: ignore[arg-type]
+    assert {one.member: bool(one.found) for one in out} == {"white": True, "some": True, "all": True, "more": False, "grey": False}
+    assert out[-1].why == "all: an attack that damages every episode"
+
+
 @pytest.mark.parametrize("damage", ["", "[]", "{}", '{"members": 3}', "import"])
 def test_a_damaged_journal_begins_again(job: standard.Job, damage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """So does one whose files are gone, or that names code."""
