@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from tailgate.engine.graph import Body, Graph, Node, Source, Sweep, computed, ordered
 from tailgate.engine.operations import Array, apply
+
+Part = Callable[[Node, list[Any]], Any]
 
 
 def evaluate(graph: Graph, roots: Sequence[Node], inputs: dict[Any, Array]) -> list[Array]:
@@ -27,7 +29,8 @@ class Evaluation:
         self._values: dict[int, Any] = {}
         self._depth = 0  # sweeps around the node that is evaluated
         self._routines: dict[int, Evaluation] = {}
-        self._parts: dict[str, Callable[[Node, list[Any]], Any]] = {
+        self._steps: dict[int, list[tuple[Node, int, tuple[int, ...], Part]]] = {}  # of lists of nodes
+        self._parts: dict[str, Part] = {
             "input": self._given, "held": self._given, "gather": self._gathered, "matvec": self._multiplied, "loop": self._looped,
             "sweep": self._swept, "pack": self._packed, "call": lambda node, args: self.call(node.attr, args),
         }  # fmt: skip
@@ -92,13 +95,21 @@ class Evaluation:
             self._values[node.id] = self._fixed[node.id] = np.array(value) if node.size else value
         return self._values[node.id]
 
-    def _run(self, nodes: Iterable[Node]) -> None:
-        values, parts = self._values, self._parts
-        for node in nodes:
-            if not node.fixed:
-                args = [values[a.id] if a.id in values else self._value(a) for a in node.args]
-                part = parts.get(node.op)
-                values[node.id] = self.compute(node, args) if part is None else part(node, args)
+    def _run(self, nodes: Sequence[Node]) -> None:
+        values = self._values
+        if (steps := self._steps.get(id(nodes))) is None:
+            steps = self._steps[id(nodes)] = self._stepped(nodes)
+        for node, there, args, part in steps:
+            values[there] = part(node, [values[a] for a in args])
+
+    def _stepped(self, nodes: Sequence[Node]) -> list[tuple[Node, int, tuple[int, ...], Part]]:
+        """Return the nodes that are computed, each with its number, those of its arguments, and what computes it."""
+        left = [node for node in nodes if not node.fixed]
+        for node in left:
+            for argument in node.args:
+                if argument.fixed:
+                    self._value(argument)  # and keeps it
+        return [(node, node.id, tuple(a.id for a in node.args), self._parts.get(node.op, self.compute)) for node in left]
 
     def _given(self, node: Node, args: list[Any]) -> Any:
         given = self._inputs[node.attr]
