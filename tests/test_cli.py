@@ -58,6 +58,7 @@ def test_list_shows_every_component_with_its_parameters(capsys: pytest.CaptureFi
     (["evaluate", "--defense", "kf"], "tailgate evaluate: error: unrecognized arguments: --defense kf; did you mean --defence?"),
     (["detect-log", "x.csv", "--defense=kf"], "tailgate detect-log: error: the following arguments are required: --defence; did you mean --defence?"),
     (["leaderboard", "run"], "tailgate leaderboard run: error: the following arguments are required: SUITE, --out"),
+    (["evaluate", "--budget", "4"], "tailgate evaluate: error: unrecognized arguments: --budget 4; did you mean --dose?"),
 ])  # fmt: skip
 def test_wrong_arguments_are_answered_in_a_line_by_the_command_that_was_asked(
     arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]

@@ -122,6 +122,11 @@ def test_what_is_no_metric_is_one_clear_error(metrics: Path, name: str, words: s
         _rows(metrics=name)
 
 
+def test_a_metric_is_named_by_a_text() -> None:
+    with pytest.raises(InputError, match=r"metric: .*expected text: module:function"):
+        _rows(metrics=[len])
+
+
 def test_a_metric_of_another_shape_costs_its_rows(metrics: Path) -> None:
     rows = _rows(metrics=["own_metrics:short", "own_metrics:speed"])
     assert {row["status"] for row in rows} == {"error"} and "metric short: got 'float64 (1,)'; expected numbers of shape (2,)" in rows[0]["reason"]

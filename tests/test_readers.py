@@ -207,3 +207,21 @@ def test_what_cannot_be_meant_is_refused(change, words):
     columns = {"t": logs.T, "gap": logs.GAP, "relative_speed": logs.LEAD - logs.OWN, "speed": logs.OWN} | change
     with pytest.raises(InputError, match=words):
         checked(Raw("a", *columns.values()), "file")
+
+
+@pytest.mark.parametrize(
+    ("mapping", "words"),
+    [
+        (["t=t", "gap=d", "speed=v", "lead_speed=w:km/h"], "m/s off the gap's rate"), (["t=t", "gap=d:furlong", "speed=v", "lead_speed=w"], "unit of d: got 'furlong'"),
+        (["t=t", "gap=e", "speed=v", "lead_speed=w"], "column: got 'e'"), ([], "--map t=COLUMN --map gap=COLUMN"),
+    ],
+)  # fmt: skip
+def test_units_that_cannot_be_meant_are_refused(tmp_path, mapping, words):
+    """One speed in m/s and the other as km/h: the gap would close by 14 m a second, and it does not."""
+    t = np.arange(0.0, 30.0, 0.1)
+    lines = [f"{x:.2f},{30.0 + 0.2 * np.sin(x):.4f},20.0,{20.0 + 0.2 * np.cos(x):.4f}" for x in t]
+    (tmp_path / "drive.csv").write_text("t,d,v,w\n" + "\n".join(lines))
+    file = str(tmp_path / "drive.csv")
+    with pytest.raises(InputError, match=re.escape(words)):
+        read(file, choice=Choice(mapping=mapping_of(mapping)))
+    assert read(file, choice=Choice(mapping=mapping_of(["t=t", "gap=d", "speed=v", "lead_speed=w"])))[0].samples == 300

@@ -2,9 +2,11 @@
 
 import dataclasses
 
+import gymnasium
 import numpy as np
 import pytest
 
+from tailgate.base.errors import InputError
 from tailgate.core.draws import Role, keys
 from tailgate.core.registry import Spec
 from tailgate.envs.gym.attacker_mdp import Seat
@@ -115,3 +117,18 @@ def test_belief_is_positive_where_a_car_thinks_it_has_more_room():
     env.reset(seed=0)
     paid = sum(env.step(np.array([1, 2]))[1] for _ in range(20))
     assert paid[0] > 0.3 and paid[1] <= 0.05
+
+
+def test_a_payment_is_given_as_an_object_too():
+    """It is paid as the name that it is registered under; shaping and costs are those of the arguments. Anything else is one error."""
+    from tailgate.envs.gym.rewards import MinGap
+
+    def played(reward):
+        env = gymnasium.make("tailgate:tailgate/CarFollowing-v1", reward=reward, gap_shaping=0.3, value=-3.0)
+        env.reset(seed=1)
+        return [env.step(1)[1] for _ in range(8)], env.unwrapped.engine
+
+    assert played(MinGap()) == played("min_gap")
+    for wrong in (3, MinGap, lambda step: 0.0):
+        with pytest.raises(InputError, match="an object of a subclass of Payment or Reward"):
+            played(wrong)

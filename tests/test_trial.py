@@ -81,3 +81,17 @@ def test_boards_that_are_shipped_are_of_their_suites() -> None:
     assert set(shipped) <= set(list_suites())
     for name in shipped:
         assert published(load_suite(name)) is not None, name
+
+
+def test_a_class_that_fails_in_every_episode_is_one_error(
+    small_ensemble: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It names the line of the class; no page is made."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    Path("suite-v1.yaml").write_text(SUITE)
+    Path("broken_defence.py").write_text(CLASS.replace("    pass", "    def step(self, *arguments):\n        return 1 / 0"))
+    assert main(["leaderboard", "try", "broken_defence:Mine", "--suite", "suite-v1.yaml", "--quiet", "--workers", "1"]) == 2
+    error = capsys.readouterr().err
+    assert "expected a class that plays an episode to its end (ZeroDivisionError" in error and "broken_defence.py, line 6" in error
+    assert not list(Path("tried").glob("**/index.html"))

@@ -19,7 +19,7 @@ from tailgate.core.schema import as_data, build, digest, fields_of
 from tailgate.core.threat import ThreatModel
 from tailgate.envs.gym.actions import ActionCodec, ActionSpec
 from tailgate.envs.gym.observations import FRAMES, ObservationCodec
-from tailgate.envs.gym.rewards import NEAR, Reward
+from tailgate.envs.gym.rewards import NEAR, Paying, Payment, Reward
 
 CAR_FOLLOWING = "tailgate/CarFollowing-v0"
 FACES: dict[str, dict[str, Any]] = {  # defaults of each id
@@ -90,8 +90,13 @@ class Outcome(NamedTuple):
 def _reward(options: dict[str, Any]) -> Reward:
     """Return the reward from its options; or the object given in their place, with the shaping of the options: ids of `-v1` set it."""
     own = options.get("reward")
-    if not isinstance(own, Reward):
+    if isinstance(own, Payment):
+        rest = build(Reward, {key: value for key, value in options.items() if key != "reward"}, "reward")
+        return Paying(**{name: getattr(rest, name) for name in fields_of(Reward) if name != "reward"}, paid=own)
+    if own is None or isinstance(own, str):
         return build(Reward, options, "reward")
+    if not isinstance(own, Reward):
+        raise InputError("reward", own, "a name (tailgate list rewards), or an object of a subclass of Payment or Reward")
     for key in options.keys() - {"reward"} - SHAPING:
         raise InputError(key, options[key], f"no such option: {type(own).__name__}, the reward given as an object, holds it")
     shaping = {key: value for key, value in options.items() if key in SHAPING}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar
 
@@ -175,3 +175,16 @@ class Reward:
     def decided(self, raw: Array, illegal: Array, before: Array, after: Array, terminated: Array) -> Array:
         """Return the reward (B,) of a decision from its steps' rewards, if it was illegal, and the potentials (B,) before and after it."""
         return np.asarray(raw - self.illegal_penalty * illegal + self.gamma * np.where(terminated, 0.0, after) - before)
+
+
+@dataclass(frozen=True)
+class Paying(Reward):
+    """A reward whose payment is an object of somebody's class."""
+
+    reward: str = "own"
+    paid: Payment = field(default_factory=Payment)
+
+    @cached_property
+    def payment(self) -> Payment:
+        """The payment of a step."""
+        return self.paid

@@ -5,14 +5,22 @@ from __future__ import annotations
 import csv
 import io
 import re
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from tailgate.base.errors import unknown
 from tailgate.base.plots import MARKERS, canvas
+from tailgate.base.pytree import Array
 
 from .files import read_board
-from .head import lines, title
+from .head import lines, title, told_columns
 from .order import ordered
-from .schema import Data
+from .schema import Curve, Data, Entry, Point
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 FORMATS = ("csv", "latex", "bibtex", "svg", "pdf")
 SPECIAL = {
@@ -52,7 +60,7 @@ def exported(board: Data, form: str, most: int | None = None) -> bytes:
         return _figure(board, form, most)
     head, *body = lines(board)
     shown = [head, *body[:most]]
-    return _csv(shown) if form == "csv" else _latex(shown, title(board)).encode()
+    return _csv(shown) if form == "csv" else _latex(board, shown).encode()
 
 
 def _csv(shown: list[tuple[str, ...]]) -> bytes:
@@ -67,13 +75,12 @@ def escaped(text: str) -> str:
     return "".join(SIGNS[part] if part in SIGNS else "".join(SPECIAL.get(one, one) for one in part) for part in parts)
 
 
-def _latex(shown: list[tuple[str, ...]], caption: str) -> str:
-    """Return a table of the package booktabs; a column with nothing in it is left out."""
-    head, *body = shown
-    kept = [i for i in range(len(head)) if any(line[i] for line in body)]
-    rows = [" & ".join(escaped(line[i]) for i in kept) + r" \\" for line in (head, *body)]
+def _latex(board: Data, shown: list[tuple[str, ...]]) -> str:
+    """Return a table of the package booktabs."""
+    kept, name = told_columns(board, shown), re.sub(r"[^A-Za-z0-9]+", "-", board["suite"]["name"]).strip("-")
+    rows = [" & ".join(escaped(line[i]) for i in kept) + r" \\" for line in shown]
     return "\n".join([
-        r"\begin{table}", r"\centering", rf"\caption{{{escaped(caption)}}}", r"\label{tab:tailgate}",
+        r"\begin{table}", r"\centering", rf"\caption{{{escaped(title(board))}}}", rf"\label{{tab:tailgate-{name}}}",
         rf"\begin{{tabular}}{{{'l' * len(kept)}}}", r"\toprule",
         rows[0], r"\midrule", *rows[1:], r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
     ])  # fmt: skip
@@ -103,18 +110,12 @@ def _figure(board: Data, form: str, most: int | None) -> bytes:
     held = read_board(board)
     curves = {curve.defence: curve for curve in held.curves if curve.knowledge == "black"}
     entries = [entry for entry in ordered(held.entries) if entry.defence in curves][:most]
-    figure, ((axes,),) = canvas(6.4, 4.0)
-    for i, entry in enumerate(entries):
-        points = [point for point in curves[entry.defence].points if point.dose is not None]
-        x, y = [point.dose for point in points], [100.0 * point.value for point in points]
-        if i < DRAWN:
-            axes.plot(x, y, marker=MARKERS[i], label=entry.defence)
-        else:
-            axes.plot(x, y, color="0.75", linewidth=0.8, zorder=0)
-    axes.set(xlabel="dose [attacked steps]", ylabel="damaged episodes [%]", ylim=(-2, 102), title=f"{held.suite.name}, black box")
-    axes.grid(alpha=0.3)
-    if entries:
-        figure.legend(fontsize="small", loc="outside right upper")
+    if len(held.suite.doses) == 1:
+        figure = _at_one_dose(entries, curves)
+    else:
+        figure = _over_doses(entries, curves)
+    figure.axes[0].set_title(f"{held.suite.name}, black box")
+    figure.axes[0].grid(alpha=0.3)
     out = io.BytesIO()
     metadata = {"Date": None} if form == "svg" else {"CreationDate": None, "Creator": None, "Producer": None}
     import matplotlib
@@ -122,3 +123,38 @@ def _figure(board: Data, form: str, most: int | None) -> bytes:
     with matplotlib.rc_context({"svg.hashsalt": held.suite.hash}):
         figure.savefig(out, format=form, metadata=metadata)
     return out.getvalue()
+
+
+def _over_doses(entries: Sequence[Entry], curves: Mapping[str, Curve]) -> Figure:
+    """Draw a line for each defence: the first ones in colour with their limits, the others grey."""
+    figure, ((axes,),) = canvas(6.4, 4.0)
+    for i, entry in enumerate(entries):
+        points = [point for point in curves[entry.defence].points if point.dose is not None]
+        x, y = [point.dose for point in points], [100.0 * point.value for point in points]
+        if i < DRAWN:
+            axes.errorbar(x, y, _limits(points), marker=MARKERS[i], capsize=2, label=entry.defence)
+        else:
+            axes.plot(x, y, color="0.75", linewidth=0.8, zorder=0, label="others" if i == DRAWN else None)
+    axes.set(xlabel="dose [attacked steps]", ylabel="damaged episodes [%]", ylim=(-2, 102))
+    if entries:
+        figure.legend(fontsize="small", loc="outside right upper")
+    return figure
+
+
+def _at_one_dose(entries: Sequence[Entry], curves: Mapping[str, Curve]) -> Figure:
+    """Draw a mark with limits for each defence, in the order of the page; a line would join what was not played."""
+    figure, ((axes,),) = canvas(6.4, 1.2 + 0.22 * max(len(entries), 1))
+    last = [next(point for point in reversed(curves[entry.defence].points) if point.dose is not None) for entry in entries]
+    axes.errorbar([100.0 * point.value for point in last], range(len(last)), xerr=_limits(last), fmt="o", color="black", capsize=2)
+    axes.set_yticks(range(len(last)), [entry.defence for entry in entries], fontsize=8)
+    axes.invert_yaxis()
+    axes.set(xlabel=f"damaged episodes at {last[0].dose} attacked steps [%]" if last else "", xlim=(-2, 102))
+    return figure
+
+
+def _limits(points: Sequence[Point]) -> Array:
+    """Return how far the limits of shares lie below and above them (2, P) [%]; 0 where there are none."""
+    ends = [(p.value if p.low is None else p.low, p.value if p.high is None else p.high) for p in points]
+    low, high = np.array(ends).reshape(-1, 2).T
+    value = np.array([p.value for p in points])
+    return np.asarray(100.0 * np.maximum([value - low, high - value], 0.0))

@@ -13,10 +13,11 @@ from tailgate.base.progress import cells, lasting
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite
 from tailgate.core.schema import digest
+from tailgate.evaluation.rows import read_rows
 
 from .attacked import Progress, attack
 from .files import agree, board_in, load, read_board, save
-from .run import board_of, play
+from .run import board_of, files_of_rows, play
 from .schema import Data
 
 SHIPPED = "boards"  # folder of the package with published boards
@@ -79,10 +80,11 @@ def try_out(
         suite, folder, defences=[defence], workers=workers, board=load(path) if keep else None,
         progress=lambda name, done, total: progress(name, done, total, cells(done, total)),
     )  # fmt: skip
+    _played(folder, defence)
     made = board_of(suite, folder, keep=keep, provisional=[defence])
     entry = _entry(made, defence)
     if entry["status"] == "unattacked":
-        say(f"attacking {defence}: {entry['why']}")
+        say(f"attacking {defence} with the standard attack ensemble, as nobody has yet")
         attack(
             suite, defence, folder / "attacked", workers=workers, progress=progress,
             announce=lambda seconds: say(f"the searches take about {lasting(seconds)}"),
@@ -90,6 +92,13 @@ def try_out(
         made = board_of(suite, folder, keep=keep, provisional=[defence])
         entry = _entry(made, defence)
     return Trial(made, path, entry)
+
+
+def _played(folder: Path, defence: str) -> None:
+    """Raise InputError for a class that failed in every episode: it has no figure, and its page would have none."""
+    rows = [row for path in files_of_rows(folder) for row in read_rows(path) if row["defence"] == defence]
+    if rows and all(row["status"] == "error" for row in rows):
+        raise InputError("defence", defence, f"a class that plays an episode to its end ({rows[0]['reason']})")
 
 
 def _entry(board: Data, defence: str) -> Data:

@@ -112,6 +112,8 @@ class _Parser(argparse.ArgumentParser):
             names = [name for name in self._option_string_actions if name.startswith("--")]
             options = [text.partition("=")[0] for text in self.given if text.startswith("--")]
             likeness, wrong = OPTION, [text for text in options if not any(name.startswith(text) for name in names)]
+        if "--budget" in wrong and "--dose" in names:
+            return "; did you mean --dose?"  # what training calls a budget
         near = [match for text in wrong for match in difflib.get_close_matches(text[:100], names, n=1, cutoff=likeness)]
         return f"; did you mean {near[0]}?" if near else ""
 

@@ -25,7 +25,8 @@ def add(commands: Commands) -> None:
     command.add_argument("--format", metavar="NAME",
                          help="openacc, ultra-av, comma2k19, sumo-fcd, veremi, csv or trace (default: by the content)")  # fmt: skip
     command.add_argument("--map", action="append", default=[], metavar="WHAT=COLUMN[:UNIT]",
-                         help="column of any CSV: t, gap, speed, and relative_speed or lead_speed (repeatable)")  # fmt: skip
+                         help="column of any CSV: t, gap, speed, and relative_speed or lead_speed (repeatable). "
+                         "UNIT: m, km, ft, s, ms, us, ns, m/s, km/h, mph, ft/s (default: s, m and m/s)")  # fmt: skip
     command.add_argument("--vehicle", metavar="NAME", help="which car, trajectory, track or id (default: all, or the longest)")
     command.add_argument("--lead", metavar="ID", help="id of the car ahead (SUMO, VeReMi)")
     command.add_argument("--length", type=float, default=5.0, metavar="M", help="length of the car ahead (SUMO, VeReMi; default 5)")

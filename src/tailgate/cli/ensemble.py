@@ -57,7 +57,7 @@ def _attack(options: argparse.Namespace) -> int:
         write_atomic(out / "attacks.txt", "".join(f"{text}\n" for text in attacks_of(report)).encode())
     show(options, report, _print)
     if not options.json and (again := _again(report, options.suite, kept=out is not None)):
-        say(f"to play the most harmful one again: {again}")
+        say(f"to play the most harmful one again: {again}", soft_wrap=True)
     return 0
 
 

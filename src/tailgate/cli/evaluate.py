@@ -122,7 +122,7 @@ def _print_summary(summary: list[dict[str, Any]], own: Sequence[str] = ()) -> No
         scenario, dose = place
         here = [entry for entry in summary if (entry["scenario"], entry["dose"]) == place]
         road = any(entry["crash"] and entry["min_gap"] for entry in here)  # else nothing drives, and an error has no unit
-        errors = ("min gap [m]", "max error [m]") if road else ("RMS error", "max error")
+        errors = ("min gap [m], median", "max error [m], median") if road else ("RMS error", "max error")
         measures = ("n", *(("collisions", "95 % interval") if road else ()), *errors, "alarm onsets", *own)
         why = any(entry["crash"] is None or entry["refused_all"] for entry in here)
         rows = []

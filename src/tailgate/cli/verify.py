@@ -36,13 +36,14 @@ def add(actions: Commands) -> None:
 def _verify(options: argparse.Namespace) -> int:
     from tailgate.base.files import writable_directory, write_atomic
     from tailgate.board.verified import digest
-    from tailgate.evaluation.rows import read_rows
+    from tailgate.evaluation.rows import Row, read_rows
     from tailgate.evaluation.verify import verify
 
     if options.out is not None:  # before anything is played
         writable_directory(Path(options.out).parent)
 
-    rows, origin, held_in = [], [], []
+    rows: list[Row] = []
+    origin, held_in = [], []
     for name in options.rows:
         held = read_rows(Path(name))
         rows += held

@@ -1,18 +1,23 @@
 """Rows: one JSON object per episode and line, with everything needed to play it again. Files named *.xz are compressed."""
 
+from __future__ import annotations
+
 import contextlib
 import json
 import lzma
 from collections.abc import Sequence
 from pathlib import Path
 from sys import intern
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, ValidationError, create_model
 
 from tailgate.base.errors import InputError, said, wanted
 from tailgate.base.reading import lines_of, parse_json
 from tailgate.play.metrics import METRICS
+
+if TYPE_CHECKING:
+    from tailgate.evaluation.frame import Rows
 
 # The columns that identify a cell: rows that differ in one of them are never summarised together.
 KEYS = (
@@ -33,8 +38,11 @@ _FIELDS: dict[str, Any] = {
 _Row = create_model("Row", __config__=ConfigDict(extra="allow"), **_FIELDS)
 
 
-def read_rows(path: Path) -> list[Row]:
+def read_rows(path: Path | str) -> Rows:
     """Read and check the rows of a JSON Lines file; raise InputError that names the line."""
+    from tailgate.evaluation.frame import Rows  # which needs the columns of this module
+
+    path = Path(path)
     rows: list[Row] = []
     lines, number, ahead = lines_of(path), 1, b""
     try:
@@ -48,7 +56,7 @@ def read_rows(path: Path) -> list[Row]:
         raise InputError("rows", str(path), f"a readable JSON Lines file ({said(error)}): {AGAIN}") from None
     except OSError as error:
         raise InputError("rows", str(path), f"a readable JSON Lines file ({said(error)})") from None
-    return rows
+    return Rows(rows)
 
 
 def _row(line: bytes, where: str, damage: str, first: bool) -> Row:

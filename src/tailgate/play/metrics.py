@@ -302,6 +302,8 @@ def own_metric(text: str) -> Own:
     InputError
         For what is neither, and for a name that every row has.
     """
+    if not isinstance(text, str):
+        raise InputError("metric", text, "text: module:function, or the name of an entry point")
     if text in METRICS and not METRICS[text].__module__.startswith("tailgate."):
         return Own(text, METRICS[text])  # registered by `metric`
     points = _points()

@@ -140,7 +140,7 @@ def detect(
     for recording in recordings if attacks else ():
         if (longest := max(len(part.gap) for part in recording.segments) * recording.dt) < settings.window:
             wanted = f"a segment as long as a window ({settings.window:g} s; --window sets it)"
-            raise InputError(f"recording {recording.name}", f"{longest:g} s", wanted)
+            raise InputError(f"recording {recording.name}".rstrip(), f"{longest:g} s", wanted)
     out: list[dict[str, Any]] = []
     kept: list[Played] = []
     total = len(recordings) * len(defences) * (1 + len(attacks))
@@ -254,7 +254,7 @@ def draw(played: Played) -> bytes:
         _shade(ax, t, trace.alarm[:n, i, 0], "C1", "alarm")
         ax.grid(alpha=0.3)
         ax.legend(fontsize=8, loc="upper right")
-    gap.set(ylabel="gap [m]", title=f"{played.recording}: {played.defence}, attack {played.attack}")
+    gap.set(ylabel="gap [m]", title=f"{played.recording or 'recording'}: {played.defence}, attack {played.attack}")
     score.set(ylabel="score", xlabel="time [s]", yscale="symlog")
     return png(figure)
 

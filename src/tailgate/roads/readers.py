@@ -51,7 +51,7 @@ def mapping_of(texts: Sequence[str]) -> tuple[tuple[str, str, str], ...]:
     out = []
     for text in texts:
         what, sep, rest = text.partition("=")
-        column, _, unit = rest.rpartition(":") if rest.rpartition(":")[2] in UNITS else (rest, "", "")
+        column, _, unit = rest.rpartition(":") if rest.rpartition(":")[2] in UNITS else (rest, "", "")  # a column's name may have a colon
         if not sep or not column:
             raise InputError("--map", text, "WHAT=COLUMN or WHAT=COLUMN:UNIT, such as speed=v_ego:km/h")
         if what not in WANTED:
@@ -104,7 +104,8 @@ def _kind(source: str, path: Path, choice: Choice) -> str:
             return "openacc"
         if "Space_Gap" in cells:
             return "ultra-av"
-    raise InputError("file", source, f"a known header, or --format ({', '.join(FORMATS)}) or --map")
+    mapped = " ".join(f"--map {what}=COLUMN" for what in ("t", "gap", "speed", "lead_speed"))
+    raise InputError("file", source, f"a known header, or --format ({', '.join(FORMATS)}), or {mapped}")
 
 
 # -- tables
@@ -120,6 +121,8 @@ class Table:
 
     def numbers(self, column: str, empty_is_nan: bool = True) -> Array:
         """Return a column (K,) as numbers; an empty cell or nan is NaN. Raise InputError that names the line."""
+        if column not in self.columns and column.rpartition(":")[0] in self.columns:
+            raise unknown(f"{self.name}: unit of {column.rpartition(':')[0]}", column.rpartition(":")[2], UNITS)
         if column not in self.columns:
             raise unknown(f"{self.name}: column", column, self.columns)
         out = np.empty(len(self.columns[column]))

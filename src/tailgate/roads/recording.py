@@ -18,6 +18,7 @@ MISSING = 0.5  # largest share of missing readings
 REPEATED = 0.01  # largest share of repeated times
 BREAK = 1.5  # times the distance of samples: a longer one ends a segment
 MOST = 5_000_000  # samples
+OFF = 5.0  # median difference of relative speed and the gap's rate that no sensor has [m/s]
 
 
 class Raw(NamedTuple):
@@ -170,7 +171,13 @@ def _meant(recording: Recording, name: str) -> None:
         rate.append((part.gap[wide:] - part.gap[:-wide])[both])
         told.append((total[wide:] - total[:-wide])[both])
     x, y = np.concatenate([np.zeros(0), *told]), np.concatenate([np.zeros(0), *rate])
-    if len(x) < 20 or x.std() < 0.05:  # nobody moves against the other
+    if len(x) < 20:
+        return
+    off = float(np.median(x - y))
+    if abs(off) > OFF:
+        wanted = "the gap's rate; are all speeds in the unit that is named?"
+        raise InputError(f"{name}: relative speed", f"{off:.1f} m/s off the gap's rate", wanted)
+    if x.std() < 0.05:  # nobody moves against the other
         return
     slope = float(np.dot(x, y) / np.dot(x, x))
     if slope < -0.5:
