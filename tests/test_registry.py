@@ -91,6 +91,7 @@ def test_somebody_elses_class(plugin):
 
 
 BAD = [
+    ("defence", "mydefence.py", "a class of that file, as mydefence:Class"), ("attack", "myattack.py", "as myattack:Class"),
     ("defence", "chi2_fk", r"defence: got 'chi2_fk'; expected one of these \(did you mean 'chi2_kf'\?\): .*kf"),
     ("attack", "fdi_rampp", r"attack.*did you mean 'fdi_ramp'"), ("defence", "", r"defence: got ''; expected one of"),
     ("defence", "chi2_kf:etta=3", r"chi2_kf: unknown field: got 'etta'.*did you mean 'eta'"),

@@ -95,6 +95,12 @@ def test_a_scenario_is_a_mapping_an_object_or_a_path_too(tmp_path: Path) -> None
     assert as_dict.reset(seed=0)[0]
 
 
+def test_a_file_of_another_ending_is_no_scenario(tmp_path: Path) -> None:
+    (tmp_path / "drive.csv").write_text("t,v\n")
+    with pytest.raises(InputError, match=r"expected a file that ends with \.yaml"):
+        load_scenario(str(tmp_path / "drive.csv"))
+
+
 def test_two_scenarios_of_one_name_are_refused() -> None:
     with pytest.raises(InputError, match="scenarios: got 'custom'; expected scenarios of different names"):
         tailgate.evaluate(scenarios=[FIELDS, FIELDS | {"horizon": 60}], defences="kf", attacks="none", seeds=1)

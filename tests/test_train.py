@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shlex
 import subprocess
 import sys
 import time
@@ -152,6 +153,11 @@ def test_the_command_trains_compares_and_writes_a_page(
     assert ("chi2_kf", str(Path("runs/quickstart/policy-0.json"))) in played and ("kf", "none") in played
     page = (run / "page" / "index.html").read_text(encoding="utf-8")
     assert "quickstart" in page and "learned" in page
+    again = next(line for line in done.stderr.splitlines() if line.startswith("play:"))
+    capsys.readouterr()
+    assert cli.main([*shlex.split(again)[2:], "--seeds", "2", "--json"]) == 0  # what the policy was granted is granted
+    (entry,) = json.loads(capsys.readouterr().out)
+    assert entry["attack"] == str(Path("runs/quickstart/policy-0.json")) and entry["n"] == 2
     assert cli.main(["train", "steps=1920", "--resume"]) == 0  # the rest of the configuration is the run's own
     decisions = json.loads((run / "policy-0.json").read_text())["training"]["steps"]
     assert decisions == 1920 and f"{decisions:,} decisions" in (run / "page" / "index.html").read_text(encoding="utf-8")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -100,7 +101,16 @@ def _train(options: argparse.Namespace) -> int:
     if report["advantage"]["no attack"]["value"] <= 0.0:
         tell(_harmless(config, max(report["decisions"])))
     errors.print(f"policy: {', '.join(str(p) for p in policies)}\npage:   {page}")
+    errors.print(f"play:   {_again(config, policies[0])}", markup=False, highlight=False, soft_wrap=True)
     return 0
+
+
+def _again(config: TrainConfig, policy: Path) -> str:
+    """Return the command that plays a policy where it was trained."""
+    words = ["tailgate", "evaluate", "--scenario", config.scenario, "--defence", config.defence, "--attack", str(policy)]
+    for key, value in config.threat.items():
+        words += ["--dose", str(value)] if key == "budget" and value is not None else ["--threat", f"{key}={json.dumps(value)}"]
+    return shlex.join(words)
 
 
 def _harmless(config: TrainConfig, decisions: int) -> str:

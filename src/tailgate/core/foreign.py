@@ -76,6 +76,8 @@ def _near(name: str, names: Iterable[str]) -> str:
 def unregistered(family: str, name: str, known: Iterable[str], imports: bool) -> InputError:
     """Return the error for a name that is not registered. imports: somebody's class may be named as module:Class."""
     error = unknown(family, name, known)
+    if imports and name.endswith(".py"):
+        return InputError(family, name, f"a class of that file, as {Path(name).stem}:Class")
     if imports and name[:1].isupper() and name.isidentifier():
         return InputError(family, name, f"a class of yours as module:{name}, or {error.expected}")
     if not imports and ":" in name:

@@ -164,6 +164,8 @@ def config_path(folder: str, name: str, where: str) -> Path:
     if name.endswith(YAML_ENDS):
         return Path(name)
     known = _builtin(folder)
+    if name not in known and Path(name).is_file():
+        raise InputError(where, name, f"a file that ends with {' or '.join(YAML_ENDS)}, or one of {', '.join(known)}")
     if name not in known:
         raise unknown(where, name, known)
     return known[name]
