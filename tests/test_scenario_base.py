@@ -32,7 +32,7 @@ threat_model: {kinds: [dos_jam, dos_hold, dos_hold_fresh, dropout, fdi], fdi_bou
     same = {"name": "x", "about": "y"}
     assert dataclasses.replace(closer, **same).config_hash == dataclasses.replace(whole, **same).config_hash
     assert closer.config_hash != base.config_hash
-    assert (closer.name, closer.about) == ("closer", base.about)
+    assert (closer.name, closer.about) == ("closer", base.about) and repr(closer) == "<Scenario closer: CarFollowing, Odometry, AdaptiveCruise, StopAndGo, 600 steps>"
     assert closer.plant == base.plant and closer.manoeuvre == base.manoeuvre and closer.threat_model.kinds == base.threat_model.kinds
 
 

@@ -8,7 +8,9 @@ from __future__ import annotations
 import argparse
 import difflib
 import re
+import shutil
 import sys
+import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
@@ -20,6 +22,7 @@ from tailgate.base.errors import InputError, Killed
 from tailgate.base.interrupts import Ending, orderly
 from tailgate.base.progress import silent
 from tailgate.cli.completion import complete
+from tailgate.cli.examples import EXAMPLES, GROUPS
 
 EXIT_INPUT = 2
 CHOICE, OPTION = 0.6, 0.75  # likeness from which a name is suggested; options have their dashes in common
@@ -91,7 +94,7 @@ class _Parser(argparse.ArgumentParser):
     given: tuple[str, ...] = ()
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
+        super().__init__(*arguments, **{"formatter_class": _Formatter} | options)
         self.add_argument("--quiet", action="store_true", default=argparse.SUPPRESS, help="show no progress")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
@@ -118,12 +121,49 @@ class _Parser(argparse.ArgumentParser):
         return f"; did you mean {near[0]}?" if near else ""
 
 
+class _Formatter(argparse.HelpFormatter):
+    """Wraps paragraphs, and keeps lines that begin with a blank as they are, such as those of an example."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        lines = []
+        for line in text.split("\n"):
+            lines.append(line if not line or line.startswith(" ") else super()._fill_text(line, width, indent))
+        return "\n".join(lines)
+
+
+def _shown(parser: argparse.ArgumentParser, words: str = "") -> None:
+    """Give each command its example."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, command in action.choices.items():
+                _shown(command, f"{words} {name}".strip())
+    if words in EXAMPLES:
+        example = f"example:\n  {parser.prog} {EXAMPLES[words]}"
+        parser.epilog = example if parser.epilog is None else f"{example}\n\n{parser.epilog}"
+
+
+def _grouped(commands: argparse._SubParsersAction[Any]) -> str:
+    """Return the commands by group with their helps, and leave them out of the usual list."""
+    helps = {action.dest: action.help for action in commands._choices_actions}
+    commands._choices_actions.clear()
+    wide = max(map(len, helps)) + 2
+    indent, width, lines = " " * (wide + 2), shutil.get_terminal_size().columns - 2, list[str]()
+    for group, names in GROUPS.items():
+        lines.append(f"{group}:")
+        for name in names:
+            lines += textwrap.wrap(helps[name] or "", max(width, 60), initial_indent=f"  {name:{wide}}", subsequent_indent=indent)
+        lines.append("")
+    return "\n".join(lines)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="tailgate", description=(tailgate.__doc__ or "").split("\n")[0])
     parser.add_argument("--version", action="version", version=f"tailgate {tailgate.__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for name in COMMANDS:
         import_module(f"tailgate.cli.{name}").add(commands)
+    _shown(parser)
+    parser.epilog = f"{_grouped(commands)}\ntailgate COMMAND --help explains one, with an example."
     return parser
 
 

@@ -78,6 +78,10 @@ class Scenario:
         data = dataclasses.asdict(self.threat_model) | changes
         return dataclasses.replace(self, threat_model=build(ThreatModel, data, "threat_model"))
 
+    def __repr__(self) -> str:
+        parts = ", ".join(type(part).__name__ for part in (self.plant, self.sensor, self.controller, self.manoeuvre))
+        return f"<Scenario {self.name}: {parts}, {self.horizon} steps>"
+
     @property
     def config_hash(self) -> str:
         return digest(self)
