@@ -233,6 +233,8 @@ def test_the_command_without_a_chapter(tmp_path, covered, monkeypatch, capsys):
     assert cli.main(["reproduce", "--seeds", "10", "--out", str(tmp_path / "all"), "--json"]) == 0
     shown = capsys.readouterr()
     assert [claim["id"] for claim in json.loads(shown.out)] == [f"{c}-a" for c in CHAPTERS] and "ch5: " in shown.err
-    assert (tmp_path / "all" / "index.html").is_file()
+    page = (tmp_path / "all" / "index.html").read_text(encoding="utf-8")
+    for verdict in ("yes", "partly", "no"):  # a box for each, which hides its claims
+        assert page.count(f'id="show-{verdict}" checked') == 1 and f"body:has(#show-{verdict}:not(:checked)) .claim.{verdict}" in page
     assert cli.main(["reproduce", "--seeds", "9", "--out", str(tmp_path / "few")]) == 2
     assert "seeds" in capsys.readouterr().err and not (tmp_path / "few").exists()
