@@ -42,36 +42,23 @@ def _whole(result: dict[str, Any], folder: Path) -> str:
 
 def test_an_interrupted_search_goes_on(job: standard.Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Networks begin with scripts of the journal; the result is that of a search in one go, and no journal is left."""
-    straight = standard.search(job, tmp_path / "one")
+    (straight,) = standard.searched([job], tmp_path / "one")
     for stop in ("networks", "grey networks", "gradient"):
         _counted(monkeypatch, stop)
         with pytest.raises(KeyboardInterrupt):
             standard.search(job, tmp_path / "two")
     began = _counted(monkeypatch)
-    assert _whole(standard.search(job, tmp_path / "two"), tmp_path / "two") == _whole(straight, tmp_path / "one")
+    with monkeypatch.context() as patch:  # between the last member and the result
+        patch.setattr(standard, "_strongest", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
+        with pytest.raises(KeyboardInterrupt):
+            standard.searched([job], tmp_path / "two")
+    (result,) = standard.searched([job], tmp_path / "two")
+    assert _whole(result, tmp_path / "two") == _whole(straight, tmp_path / "one")
     assert began == ["gradient"]
     assert not list(tmp_path.glob("*/searches/*.journal"))
 
 
-def test_nobody_searches_behind_an_attack_that_damages_every_episode(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those who know as much or more are passed over, with the reason; those who know less are not."""
-    from tailgate.ensemble.search import Found
-
-    def finds(name: str, knowledge: str, damage: float) -> members.Member:
-        return members.Member(name, knowledge, lambda hunt: [f"{name}/{damage}"])
-
-    class Place:
-        def best(self, texts: list[str]) -> list[Found]:
-            return [Found(text, float(text.partition("/")[2]), 0.0, 1) for text in texts]
-
-    team = [finds("white", "white", 1.0), finds("some", "black", 0.99), finds("all", "black", 1.0), finds("more", "black", 0.5), finds("grey", "grey", 1.0)]
-    monkeypatch.setattr(members, "MEMBERS", tuple(team))
-    out = members.harvest(Hunt(Place(), members.BUDGETS["quick"], 0, Path()))  # type: ignore[arg-type]
-    assert {one.member: bool(one.found) for one in out} == {"white": True, "some": True, "all": True, "more": False, "grey": False}
-    assert out[-1].why == "all: an attack that damages every episode"
-
-
-@pytest.mark.parametrize("damage", ["", "[]", "{}", '{"members": 3}', "import"])
+@pytest.mark.parametrize("damage", ["", "[]", '{"members": 3}', "attack: evil:Attack", "attack: nosuch:x=1", "member: x0", "damage: 2.0", "score: null"])
 def test_a_damaged_journal_begins_again(job: standard.Job, damage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """So does one whose files are gone, or that names code."""
     _counted(monkeypatch, "transfer")
@@ -80,9 +67,15 @@ def test_a_damaged_journal_begins_again(job: standard.Job, damage: str, tmp_path
     (path,) = tmp_path.glob("searches/*.journal")
     held = json.loads(path.read_text())
     assert [one["member"] for one in held["members"]] == ["scripts", "programs"]
-    if damage == "import":
-        held["members"][0]["found"][0]["attack"] = "evil:Attack"
-    path.write_text(json.dumps(held) if damage == "import" else damage)
+    key, _, value = damage.partition(": ")
+    one = held["members"][0]
+    if key in one["found"][0]:
+        one["found"][0][key] = value if key == "attack" else json.loads(value)
+    elif key in one:
+        one[key] = value
+    else:
+        held = None
+    path.write_text(json.dumps(held) if held else damage)
     began = _counted(monkeypatch, "transfer")
     with pytest.raises(KeyboardInterrupt):
         standard.search(job, tmp_path)

@@ -14,6 +14,8 @@ import pytest
 
 import tailgate
 from tailgate.base.errors import InputError
+from tailgate.evaluation.rows import read_rows
+from tailgate.evaluation.summary import summarise
 
 PAGE = (Path(__file__).parents[1] / "docs/new-parts.md").read_text(encoding="utf-8")
 NAMES = ("pyproject.toml", "drone.py", "drone.yaml")
@@ -26,6 +28,9 @@ def short(trace):
     return np.zeros(1)
 
 def seed(trace):
+    return np.zeros(trace.batch)
+
+def crash(trace):
     return np.zeros(trace.batch)
 
 def crashed(trace):
@@ -113,7 +118,7 @@ def test_a_metric_is_a_column_in_every_process(metrics: Path, tmp_path: Path) ->
     ("name", "words"),
     [
         ("crashed", "one of your own"), ("nobody", "module:function, or the name of an entry point"), ("own_metrics:sped", "did you mean 'speed'"),
-        ("own_metrics:seed", "no column of a row"), ("own_metrics:crashed", "a name that is not taken"), ("own_metrics:Metric", "a function of a trace"),
+        ("own_metrics:seed", "no column of a row"), ("own_metrics:crash", "no column of a row"), ("own_metrics:crashed", "a name that is not taken"), ("own_metrics:Metric", "a function of a trace"),
         ("nowhere:speed", "an importable module"),
     ],
 )  # fmt: skip
@@ -125,6 +130,25 @@ def test_what_is_no_metric_is_one_clear_error(metrics: Path, name: str, words: s
 def test_a_metric_is_named_by_a_text() -> None:
     with pytest.raises(InputError, match=r"metric: .*expected text: module:function"):
         _rows(metrics=[len])
+
+
+def test_two_metrics_have_two_names(metrics: Path) -> None:
+    (metrics / "other_metrics.py").write_text(METRIC)
+    with pytest.raises(InputError, match=r"metric: got 'speed'; expected .* no other metric"):
+        _rows(metrics=["own_metrics:speed", "other_metrics:speed"])
+    sys.modules.pop("other_metrics", None)
+
+
+def test_rows_with_and_without_a_metric_are_summarised_together(metrics: Path, tmp_path: Path) -> None:
+    """The figure is that of the rows that have one; a column that is named and is no number is one error."""
+    rows = [*_rows(), *tailgate.evaluate(scenarios="stop-and-go-v0", defences="kf", attacks="none", seeds=3, metrics="own_metrics:speed")[2:]]
+    (entry,) = summarise(rows)
+    assert entry["n"] == 3 and entry["speed"]["median"] == rows[2]["speed"]
+    file = tmp_path / "rows.jsonl"
+    for wrong in ({"metrics": 3}, {"metrics": ["nope"]}, {"metrics": ["defence"]}):
+        file.write_text(json.dumps(rows[0] | wrong) + "\n")
+        with pytest.raises(InputError, match="line 1"):
+            read_rows(file)
 
 
 def test_a_metric_of_another_shape_costs_its_rows(metrics: Path) -> None:

@@ -56,7 +56,13 @@ def test_an_episode_is_drawn_with_its_attack(rows):
     assert np.array_equal(lines["gap"][1:, 1], trace.gap[: len(lines["gap"]) - 1, 1, 0])
     error = trace.model.gap_error(trace.estimate[:, 1], trace.truth[:, 1])[: len(lines["gap"]), 0]
     assert np.allclose(lines["believed gap"][:, 1] - lines["gap"][:, 1], error)
-    assert "attack" in ax.get_legend_handles_labels()[1]
+    spans = [patch.get_extents().transformed(ax.transData.inverted()).intervalx.tolist() for patch in ax.patches]
+    hit = np.flatnonzero(trace.kind[: trace.length[1], 1] != 0)
+    assert np.isclose(sum(end - begin for begin, end in spans), trace.dt * len(hit)) and np.isclose(spans[0][0], trace.dt * hit[0])
+    calm = tailgate.plot.episode(trace_of("stop-and-go-v0", "kf", "dos_hold"), row=0)
+    assert len(calm.axes[0].patches) > 0
+    calm = tailgate.plot.episode(rollout(load_scenario("stop-and-go-v0").loop(tailgate.make_defence("kf")), tailgate.make_attack("none"), keys("report", [0])))
+    assert calm.axes[0].get_legend_handles_labels()[1] == ["gap", "believed gap"]
     network = trace_of("thesis-ch5-v0", "dkf", "fdi")
     (line, *_), truth = tailgate.plot.episode(network, agent=3).axes[0].lines, network.truth[:, 0]
     assert np.array_equal(line.get_ydata(), network.model.error(network.estimate[:, 0], truth)[:, 3])
@@ -66,7 +72,7 @@ def test_an_episode_is_drawn_with_its_attack(rows):
     ("draw", "words"),
     [
         (lambda rows: tailgate.plot.matrices(rows), "2 scenarios and doses"), (lambda rows: tailgate.plot.matrices([]), "0 scenarios and doses"),
-        (lambda rows: tailgate.plot.dose_response([]), "rows with doses"), (lambda rows: tailgate.plot.error_against_gap([]), "on a road"),
+        (lambda rows: tailgate.plot.dose_response([*rows, *(row | {"version": "9"} for row in rows)]), "twice"), (lambda rows: tailgate.plot.dose_response([]), "rows with doses"), (lambda rows: tailgate.plot.error_against_gap([]), "on a road"),
         (lambda rows: tailgate.plot.episode(trace_of("stop-and-go-v0", "kf", "fdi"), row=2), r"row: got 2; expected a whole number from 0 to 1"),
         (lambda rows: tailgate.plot.episode(trace_of("stop-and-go-v0", "kf", "fdi"), agent=-1), "agent: got -1"),
     ],

@@ -183,6 +183,21 @@ def test_plug_ins_by_entry_point(shelf, plugin, monkeypatch):
         tailgate.make_defence("minee")
 
 
+def test_a_plug_in_is_seen_as_a_part_too(shelf, plugin, monkeypatch):
+    """Rows that name it run somebody's code, and another file makes other rows."""
+    registry._plugged.cache_clear()
+    _points(monkeypatch, "tailgate.detectors", mine=f"{plugin}:Mine")
+    spec = Spec("defence", "composed:filter=kf,detector=mine")
+    assert spec.foreign and len(spec.digest) == 64 and not Spec("defence", "composed:filter=kf,detector=cusum").foreign
+    registry._plugged.cache_clear()
+
+
+def test_a_plug_in_without_the_methods_of_its_family_is_a_warning(shelf, plugin, monkeypatch):
+    _points(monkeypatch, "tailgate.plants", mine=f"{plugin}:Mine")
+    with pytest.warns(UserWarning, match=r"'mine' of tailgate.plants cannot be loaded: .*expected a class with model, prepare"):
+        assert "mine" not in entries("plant")
+
+
 def test_a_plug_in_cannot_take_a_built_in_name(shelf, plugin, monkeypatch):
     """The clash is reported whenever the family is asked for, and the built-in one stays."""
     _points(monkeypatch, "tailgate.estimators", kf=f"{plugin}:Mine")

@@ -61,8 +61,8 @@ horizon: 100
     ("text", "words"),
     [
         ("base: gusty", r"scenario m\.base: got 'gusty'; expected one of .*"), ("base: 3", r"m\.base: got 3; expected the name or the file"),
-        ("base: [a]", r"m\.base"), ("base: nobody.yaml", r"nobody\.yaml"), ("base: n.yaml", "a scenario without a base of its own"),
-        ("base: m.yaml", "a scenario without a base of its own"), ("base: stop-and-go-v0\ncontroller: {headwai: 2.0}", "headwai"),
+        ("base: [a]", r"m\.base"), ("base: nobody.yaml", r"nobody\.yaml"), ("base: n.yaml", "a scenario that has no base"),
+        ("base: m.yaml", "a scenario that has no base"), ("base: stop-and-go-v0\ncontroller: {headwai: 2.0}", "headwai"),
         ("base: stop-and-go-v0\nthreat_model: 3", r"m\.threat_model: got 3"), ("bases: stop-and-go-v0", "did you mean 'base'"),
     ],
 )  # fmt: skip
@@ -99,11 +99,19 @@ def test_a_file_of_another_ending_is_no_scenario(tmp_path: Path) -> None:
     (tmp_path / "drive.csv").write_text("t,v\n")
     with pytest.raises(InputError, match=r"expected a file that ends with \.yaml"):
         load_scenario(str(tmp_path / "drive.csv"))
+    with pytest.raises(InputError, match="expected one of"):
+        load_scenario("a" * 5000)
 
 
 def test_two_scenarios_of_one_name_are_refused() -> None:
-    with pytest.raises(InputError, match="scenarios: got 'custom'; expected scenarios of different names"):
-        tailgate.evaluate(scenarios=[FIELDS, FIELDS | {"horizon": 60}], defences="kf", attacks="none", seeds=1)
+    """So are an object under a built-in scenario's name with other content, and under a file's."""
+    taken = [FIELDS, FIELDS | {"horizon": 60}], FIELDS | {"name": "stop-and-go-v0"}, FIELDS | {"name": "x.yaml"}
+    for wrong in taken:
+        with pytest.raises(InputError, match=r"scenarios: got '.*'; expected a different name for each object"):
+            tailgate.evaluate(scenarios=wrong, defences="kf", attacks="none", seeds=1)
+    built_in = load_scenario("stop-and-go-v0").with_threat(budget=5)
+    (row,) = tailgate.evaluate(scenarios=[built_in, built_in], defences="kf", attacks="none", seeds=1)
+    assert (row["scenario"], row["dose"]) == ("stop-and-go-v0", 5)
 
 
 @pytest.mark.parametrize("value", [3, None, ["a"], {"horizon": 3}, {"base": "nobody"}, {"headway": 2}])

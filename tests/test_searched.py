@@ -131,6 +131,8 @@ def test_a_rank_asks_for_the_searches(made: tuple[Path, Path]) -> None:
     assert why([line | {"cells": empty}]) == "the search on radar-braking-v0 at dose 4 is not whole: no member scripts"
     idle = [cell | {"members": [one | {"attack": None} for one in cell["members"]]} for cell in line["cells"]]
     assert why([line | {"cells": idle}]).endswith("not whole: not one attack of a black box")
+    left = [cell | {"members": [one | {"damage": None, "attack": None, "why": standard.ELSEWHERE} for one in cell["members"]]} for cell in line["cells"]]
+    assert why([line | {"cells": left}]).endswith("not whole: scripts did not search")
     assert why([line | {"cells": []}]) == "the ensemble has not attacked it on radar-braking-v0 at dose 4"
     for place in suite.scenarios:
         left = [row for row in rows if (row["attack"], row["scenario"]) != (attack, place)]
@@ -266,16 +268,26 @@ def test_two_boards_in_a_folder_are_refused(tmp_path: Path) -> None:
         board_in(tmp_path)
 
 
-@pytest.mark.parametrize("attack", ["stealth:trigger=near,threshold=18", "zoo:name=car-following-chi2_kf-2", "fdi_gaussian:start_step=3,mean=-3,sd=1"])
-def test_whole_episodes_have_the_outcome_of_their_trace(attack: str) -> None:
+@pytest.mark.parametrize(
+    ("suite", "place", "attack"),
+    [
+        ("car-following-v1", "gusty-stop-and-go-v0", "stealth:trigger=near,threshold=18"),
+        ("car-following-v1", "gusty-stop-and-go-v0", "zoo:name=car-following-chi2_kf-2"),
+        ("platoon-v1", "platoon-gusty-v0", "fdi_gaussian:start_step=3,mean=-3,sd=1"), ("lane-v0", "lane-keeping-v0", "fdi:start_step=200,value=1"),
+        ("lane-v0", "lane-keeping-v0", "none"), ("network-v1", "network-restless-v0", "fdi:value=5"),
+    ],
+)  # fmt: skip
+def test_whole_episodes_have_the_outcome_of_their_trace(suite: str, place: str, attack: str) -> None:
     """An attack that the engine traces is played in one program, a white box too; a step at a time says the same."""
-    spec, keys = Spec("attack", attack), draws.keys("select", range(24))
-    arena = Arena("test", "gusty-stop-and-go-v0", 10, "chi2_kf", dict(load_suite("car-following-v1").granted), None)
+    spec, keys = Spec("attack", attack), draws.keys("select", range(16))
+    arena = Arena("test", place, 10, "dkf" if "network" in suite else "chi2_kf", dict(load_suite(suite).granted), load_suite(suite).bound)
     loop = arena.seat(spec.entry.knowledge, spec.make())
     whole = search._whole(loop, spec.make(), keys)
     assert whole is not None
+    if not loop.model.followers.any():
+        whole = whole._replace(moved=np.full(len(whole.moved), np.nan))  # nobody drives
     for name, one, other in zip(Played._fields, whole, search._stepwise(loop, spec.make(), keys), strict=True):
-        assert np.array_equal(one, other), name
+        assert np.array_equal(one, other, equal_nan=True), name
 
 
 @dataclasses.dataclass(frozen=True)

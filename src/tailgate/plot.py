@@ -12,6 +12,7 @@ import numpy as np
 
 from tailgate.base.errors import InputError
 from tailgate.base.plots import MARKERS, canvas, matrix_figure, scatter_figure
+from tailgate.base.pytree import Array
 from tailgate.core.kinds import Kind
 from tailgate.evaluation.rows import Row
 from tailgate.evaluation.summary import summarise
@@ -40,7 +41,18 @@ def matrices(rows: Sequence[Row], title: str = "") -> Figure:
     places = {(entry["scenario"], entry["dose"]) for entry in table}
     if len(places) != 1:
         raise InputError("rows", f"{len(places)} scenarios and doses", "rows of one scenario at one dose")
+    _single(table)
     return matrix_figure(table, title)
+
+
+def _single(table: Sequence[Row]) -> None:
+    """Raise InputError for two entries of one place, dose, defence and attack: of two versions, purposes or knowledges."""
+    seen = set()
+    for entry in table:
+        key = entry["scenario"], entry["dose"], entry["defence"], entry["attack"]
+        if key in seen:
+            raise InputError("rows", f"{entry['defence']} against {entry['attack']} twice", "rows of one version, purpose and knowledge")
+        seen.add(key)
 
 
 def error_against_gap(rows: Sequence[Row]) -> Figure:
@@ -68,6 +80,7 @@ def dose_response(rows: Sequence[Row]) -> Figure:
     table = [entry for entry in summarise(rows) if entry["crash"] is not None and entry["dose"] is not None]
     if not table:
         raise InputError("rows", f"{len(rows)} rows", "rows with doses in steps")
+    _single(table)
     names = list(dict.fromkeys((entry["scenario"], entry["defence"], entry["attack"]) for entry in table))
     figure, axes = canvas(7.0, 4.2)
     for i, name in enumerate(names):
@@ -79,6 +92,12 @@ def dose_response(rows: Sequence[Row]) -> Figure:
     axes[0, 0].set(xlabel="dose [attacked steps]", ylabel="episodes with a collision [%]", ylim=(-2.0, 102.0))
     axes[0, 0].legend(fontsize=8)
     return figure
+
+
+def _runs(mask: Array) -> list[tuple[int, int]]:
+    """Return the first and the last place of each run of true values of a mask (K,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
+    return [(int(first), int(last) - 1) for first, last in edges.reshape(-1, 2)]
 
 
 def episode(trace: Trace, row: int = 0, agent: int = 0) -> Figure:
@@ -113,9 +132,10 @@ def episode(trace: Trace, row: int = 0, agent: int = 0) -> Figure:
         off = trace.model.error(trace.estimate[steps, row], trace.truth[steps, row])[:, agent]
         ax.plot(time, off, "-", color="black", label="error of the estimate (2-norm)")
     hit, alarm = trace.kind[steps, row] != Kind.NONE, trace.alarm[steps, row, agent]
-    floor, top = ax.get_ylim()
-    ax.fill_between(time, floor, top, where=hit, color="0.85", step="pre", label="attack")
-    ax.plot(time[alarm], np.full(int(alarm.sum()), floor), "|", color="C3", label="alarm")
-    ax.set(xlabel="time [s]", ylim=(floor, top))
+    for i, (first, last) in enumerate(_runs(hit)):
+        ax.axvspan(trace.dt * first, trace.dt * (last + 1), color="0.85", label="" if i else "attack")
+    if alarm.any():
+        ax.plot(time[alarm], np.zeros(int(alarm.sum())), "|", color="C3", label="alarm", transform=ax.get_xaxis_transform())
+    ax.set(xlabel="time [s]")
     ax.legend(fontsize=8)
     return figure

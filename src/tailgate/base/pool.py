@@ -27,7 +27,7 @@ from tailgate.base.errors import Killed
 
 R = TypeVar("R")
 ENDING = 5.0  # [s] for an idle worker to end before it is killed
-THREADS = "OPENBLAS_NUM_THREADS"  # of numpy
+THREADS = "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"  # of numpy; the first counts
 _SIGNALS = {signal.SIGINT, signal.SIGTERM}
 _crews: weakref.WeakSet[Crew] = weakref.WeakSet()
 _hired: ContextVar[Callable[[int], Hands] | None] = ContextVar("hired", default=None)  # who takes jobs in place of local workers
@@ -99,14 +99,14 @@ class _Worker:
 @contextlib.contextmanager
 def _single() -> Iterator[None]:
     """Let processes that start here multiply matrices in one thread, unless the user says how many: workers would wait for each other."""
-    if THREADS in os.environ:
+    if any(name in os.environ for name in THREADS):
         yield
         return
-    os.environ[THREADS] = "1"
+    os.environ[THREADS[0]] = "1"
     try:
         yield
     finally:
-        del os.environ[THREADS]
+        os.environ.pop(THREADS[0], None)
 
 
 class Crew:

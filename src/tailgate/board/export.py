@@ -15,7 +15,7 @@ from tailgate.base.plots import MARKERS, canvas
 from tailgate.base.pytree import Array
 
 from .files import read_board
-from .head import lines, title, told_columns
+from .head import filled_columns, lines, title
 from .order import ordered
 from .schema import Curve, Data, Entry, Point
 
@@ -77,7 +77,7 @@ def escaped(text: str) -> str:
 
 def _latex(board: Data, shown: list[tuple[str, ...]]) -> str:
     """Return a table of the package booktabs."""
-    kept, name = told_columns(board, shown), re.sub(r"[^A-Za-z0-9]+", "-", board["suite"]["name"]).strip("-")
+    kept, name = filled_columns(board, shown), re.sub(r"[^A-Za-z0-9]+", "-", board["suite"]["name"]).strip("-")
     rows = [" & ".join(escaped(line[i]) for i in kept) + r" \\" for line in shown]
     return "\n".join([
         r"\begin{table}", r"\centering", rf"\caption{{{escaped(title(board))}}}", rf"\label{{tab:tailgate-{name}}}",

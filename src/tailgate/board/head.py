@@ -54,13 +54,13 @@ def markdown(board: Board, most: int | None = None) -> str:
     """Return the head as a Markdown table of at most this many defences; a column with nothing in it is left out."""
     heading, *body = lines(board)
     heading = tuple(f"{text}, black box" if text.startswith(("critical", "undamaged")) else text for text in heading)
-    told = told_columns(board, [heading, *body[:most]])
+    told = filled_columns(board, [heading, *body[:most]])
     rows = [[line[i].replace("|", "\\|") for i in told] for line in (heading, *body[:most])]
     rows.insert(1, ["---"] * len(told))
     return "\n".join(f"| {' | '.join(cells)} |" for cells in rows) + "\n"
 
 
-def told_columns(board: Board, shown: Sequence[Sequence[str]]) -> list[int]:
+def filled_columns(board: Board, shown: Sequence[Sequence[str]]) -> list[int]:
     """Return the numbers of the columns with something in them; with one dose a critical dose says no more than the share."""
     one = len(board["suite"]["doses"]) == 1
     return [i for i, text in enumerate(shown[0]) if any(line[i] for line in shown[1:]) and not (one and text.startswith("critical"))]

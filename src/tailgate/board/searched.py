@@ -29,7 +29,7 @@ from tailgate.evaluation.rows import Row
 from tailgate.sandbox.isolated import veiled
 from tailgate.training.adaptive import Adaptive, plan_of, stem
 
-from .damage import PLAYED, Table
+from .damage import PLAYED, SKIPPED, Table
 from .files import read_json
 from .part import Data
 from .search_results import SearchedLine
@@ -180,22 +180,32 @@ def unsearched(table: Table, row: Row, searches: Sequence[Data], plan: Adaptive)
             cell = cells.get((name, dose))
             if cell is None:
                 return f"the ensemble has not attacked it on {name} at dose {dose}"
-            if lacks := _lacking(cell):
+            if lacks := _lacking(cell, not plan.scenarios or name in plan.scenarios):
                 return f"the search on {name} at dose {dose} is not whole: {lacks}"
-        played = {one.attack for one, state in zip(table.attackers, table.state[name][index], strict=True) if (state == PLAYED).all()}
-        if left := sorted(set(asked[name]) - table.withdrawn - played):
-            return f"what the ensemble found was not played on {name}: {left[0]}"
+        here = {attack for cell in line["cells"] if cell["scenario"] == name for one in cell["members"] if (attack := one["attack"])}
+        left = set(asked[name]) - table.withdrawn
+        for one, state in zip(table.attackers, table.state[name][index], strict=True):
+            meaningless = one.attack not in here and (state == SKIPPED).all()  # found in another scenario
+            if meaningless or (state == PLAYED).all():
+                left.discard(one.attack)
+        if left:
+            return f"what the ensemble found was not played on {name}: {min(left)}"
     return ""
 
 
-def _lacking(cell: Data) -> str:
-    """Return what a whole search has and a cell has not: every member with damage or a reason, and one attack of each knowledge."""
+def _lacking(cell: Data, whole: bool) -> str:
+    """Return what a search has and a cell has not: every member with damage or a reason, and one attack of each knowledge.
+
+    whole: all members search here, so that none may leave it to another scenario.
+    """
     members = {one["member"]: one for one in cell["members"]}
     if left := [one.name for one in MEMBERS if one.name not in members]:
         return f"no member {left[0]}"
     for name, one in members.items():
         if one["damage"] is None and not one["why"]:
             return f"neither damage nor a reason of {name}"
+        if whole and one["why"] == standard.ELSEWHERE:
+            return f"{name} did not search"
     for level in KNOWLEDGE:
         mine = [one for one in members.values() if one["knowledge"] == level and one["damage"] is not None]
         if mine and sum(one["attack"] is not None for one in mine) != 1:

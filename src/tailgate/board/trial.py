@@ -84,7 +84,7 @@ def try_out(
     made = board_of(suite, folder, keep=keep, provisional=[defence])
     entry = _entry(made, defence)
     if entry["status"] == "unattacked":
-        say(f"attacking {defence} with the standard attack ensemble, as nobody has yet")
+        say(f"now the attacks on {defence}, as {entry['why']}")
         attack(
             suite, defence, folder / "attacked", workers=workers, progress=progress,
             announce=lambda seconds: say(f"the searches take about {lasting(seconds)}"),

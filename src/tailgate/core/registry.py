@@ -37,7 +37,7 @@ _MODULES = {
     "reward": "tailgate.envs",
     "learner": "tailgate.agents",
 }
-GROUPS: dict[str, str] = {family: f"tailgate.{family}s" for family in _MODULES} | {
+GROUPS: dict[str, str] = {family: f"tailgate.{family}s" for family in _MODULES if family != "learner"} | {
     "defence": "tailgate.estimators", "attack": "tailgate.agents", "metric": "tailgate.metrics",
 }  # fmt: skip
 SANDBOXES = ("bwrap", "docker")
@@ -142,14 +142,15 @@ def built_in(family: Family) -> dict[str, Entry]:
 
 def _load(family: Family) -> dict[str, Entry]:
     built_in(family)
-    if (group := GROUPS[family]) not in _plugins_loaded:
+    group = GROUPS.get(family)
+    if group and group not in _plugins_loaded:
         for point in entry_points(group=group):
             try:
-                cls = point.load()
+                entry = entry_of(family, point.name, fitting(family, point.load()))
             except Exception as error:  # somebody's broken package shall not stop those who do not use it
                 warnings.warn(f"plug-in {point.name!r} of {group} cannot be loaded: {error}", stacklevel=2)
                 continue
-            put(entry_of(family, point.name, cls))
+            put(entry)
         _plugins_loaded.add(group)  # only now: a name that is taken is an error each time
     return _entries[family]
 
@@ -158,6 +159,21 @@ def _load(family: Family) -> dict[str, Entry]:
 def _plugged(points: Callable[..., Any], group: str) -> frozenset[str]:
     """Return names of the plug-ins of a group; reading them reads all installed packages."""
     return frozenset(point.name for point in points(group=group))
+
+
+METHODS: dict[str, tuple[str, ...]] = {  # of a class; `tailgate.core.components` says what they get and give
+    "defence": ("prepare", "start", "step"), "attack": ("prepare", "start", "decide"),
+    "plant": ("model", "prepare", "start", "step", "scene"), "sensor": ("matrices", "prepare", "measure"),
+    "controller": ("prepare", "start", "step"), "manoeuvre": ("prepare", "start", "accel"), "reward": ("terms",),
+}  # fmt: skip
+
+
+def fitting(family: Family, value: object) -> type:
+    """Return a class that has the methods of its family. Raises InputError for anything else."""
+    methods = METHODS.get(family, ())
+    if not isinstance(value, type) or not all(callable(getattr(value, name, None)) for name in methods):
+        raise InputError(family, value, f"a class with {', '.join(methods)}" if methods else "a class")
+    return value
 
 
 def entry_of(family: Family, name: str, cls: type) -> Entry:
@@ -241,14 +257,22 @@ class Spec:
             put_in(params, key.strip(), scalar(value))
         return head, params
 
-    def _imported(self) -> list[tuple[Family, str]]:
-        """Return family and module:Class of everything that this text imports."""
+    def _named(self) -> list[tuple[Family, str]]:
+        """Return family and name of the component and of its parts."""
         head, params = self._parts()
         named: list[tuple[Family, Any]] = [(self.family, head)]
         for part in PARTS:
             held = params.get(part)
             named.append((part, held.get("name") if isinstance(held, dict) else held))
-        return [(family, name) for family, name in named if isinstance(name, str) and ":" in name]
+        return [(family, name) for family, name in named if isinstance(name, str)]
+
+    def _imported(self) -> list[tuple[Family, str]]:
+        """Return family and module:Class of everything that this text imports."""
+        return [(family, name) for family, name in self._named() if ":" in name]
+
+    def _plugged(self) -> list[tuple[Family, str]]:
+        """Return family and name of every plug-in that this text names, as a part too."""
+        return [(family, name) for family, name in self._named() if name in _plugged(entry_points, GROUPS[family])]
 
     def refuse_imports(self, where: str) -> None:
         """Raise InputError when this names a class to import: configuration files never run code."""
@@ -289,7 +313,7 @@ class Spec:
     @property
     def foreign(self) -> bool:
         """True if playing this runs somebody else's code outside of any sandbox: a class to import, or a plug-in."""
-        return self.imports or (not self.sandboxed and self._parts()[0] in _plugged(entry_points, GROUPS[self.family]))
+        return self.imports or (not self.sandboxed and bool(self._plugged()))
 
     @property
     def digest(self) -> str:
@@ -300,6 +324,7 @@ class Spec:
             return digest_of(self.sandboxed[1])
         head, params = self._parts()
         paths = [Path(inspect.getfile(imported(family, name).cls)) for family, name in self._imported()]
+        paths += [Path(inspect.getfile(find(family, name).cls)) for family, name in self._plugged() if family in PARTS]
         if self.family == "attack":
             paths = [Path(str(text)) for text in (head, params.get("path")) if Path(str(text)).suffix in _FILES] or paths
         if self.family == "defence" and (held := params.get("policy")) is not None:  # a defender that was trained
@@ -330,7 +355,7 @@ class Spec:
             if isinstance(error, InputError) or self.entry.built_in:
                 raise
             raise InputError(self.family, self.text, f"a class that can be made ({with_place(error)})") from None
-        steps = {"defence": ("prepare", "start", "step"), "attack": ("prepare", "start", "decide")}.get(self.family, ())
+        steps = METHODS[self.family] if self.family in ("defence", "attack") else ()
         if not all(callable(getattr(made, name, None)) for name in steps):
             raise InputError(self.family, self.text, f"a class with {', '.join(steps)}")
         if self.family == "defence" and _takes(made.step) < 5:

@@ -98,6 +98,7 @@ def _changed(part: T, changes: object, where: str) -> T:
     return build(type(part), held | changes, where) if changes else part
 
 
+NAME = 200  # characters of a file's name that is looked for
 ScenarioLike = str | Path | Mapping[str, Any] | Scenario  # what names a scenario, or is one
 
 
@@ -168,7 +169,7 @@ def config_path(folder: str, name: str, where: str) -> Path:
     if name.endswith(YAML_ENDS):
         return Path(name)
     known = _builtin(folder)
-    if name not in known and Path(name).is_file():
+    if name not in known and len(name) < NAME and Path(name).is_file():
         raise InputError(where, name, f"a file that ends with {' or '.join(YAML_ENDS)}, or one of {', '.join(known)}")
     if name not in known:
         raise unknown(where, name, known)
@@ -252,7 +253,7 @@ def _rebased(base: object, changes: dict[str, Any], path: Path, where: str) -> d
     file = path.parent / base if base.endswith(YAML_ENDS) else base
     out = _read_scenario(config_path("scenarios", str(file), where), where)
     if "base" in out:  # one level, so that nobody looks for a field in many files
-        raise InputError(where, base, "a scenario without a base of its own")
+        raise InputError(where, base, "a scenario that has no base")
     out.pop("name", None)
     for key, new in changes.items():
         old = {"name": held} if isinstance(held := out.get(key), str) and key in _COMPONENTS else held

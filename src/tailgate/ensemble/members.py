@@ -14,7 +14,6 @@ from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array
 from tailgate.core.registry import Spec, entries
 from tailgate.core.schema import fields_of
-from tailgate.core.threat import KNOWLEDGE
 from tailgate.engine.untraceable import Untraceable
 from tailgate.ensemble.gradient import Pace, gradient
 from tailgate.ensemble.networks import FORMS, PUBLISHED, Phase, Race, is_ramp, learned, transferred
@@ -173,28 +172,24 @@ def _share(tell: Tell, number: int, members: int) -> Tell:
     return lambda done, total, text, mean: tell(100 * (number * total + done) // (members * total), 100, text, mean)
 
 
-def _settled(member: Member, before: Sequence[Harvest]) -> str:
-    """Return why a member need not search after others; empty where it has to."""
-    knows = KNOWLEDGE[: KNOWLEDGE.index(member.knowledge) + 1]
-    sure = [one.member for one in before if one.found and one.found[0].damage == 1.0 and one.knowledge in knows]
-    return f"{sure[0]}: an attack that damages every episode" if sure else ""
+def members_of(hunt: Hunt) -> list[Member]:
+    """Return the members that search, in order."""
+    return [one for one in MEMBERS if not hunt.only or one.name in hunt.only]
 
 
 def harvest(hunt: Hunt, before: Sequence[Harvest] = (), after: Callable[[list[Harvest]], None] | None = None) -> list[Harvest]:
     """Let every member search that is asked for; return what each found. `hunt.tell` is called with the share of the whole search.
 
-    Members are passed over once an attack that knows no more than they do damages every episode of the last stage: nothing is left to find.
     before: what the first members have found already; after: called behind each member with what is found by then.
     """
     out, tell = list(before), hunt.tell
-    searching = [one for one in MEMBERS if not hunt.only or one.name in hunt.only]
+    searching = members_of(hunt)
     for number, member in enumerate(searching[len(out) :], len(out)):
         hunt.tell = None if tell is None else _share(tell, number, len(searching))
-        found, why = [], _settled(member, out)
+        found, why = [], ""
         try:
-            if not why:
-                found = hunt.arena.best(member.find(hunt))
-                why = "" if found else "the threat model grants nothing for it"
+            found = hunt.arena.best(member.find(hunt))
+            why = "" if found else "the threat model grants nothing for it"
         except (NotApplicable, ImportError, Untraceable) as error:  # not traced: no derivative
             why = str(error)
         hunt.found[member.name] = found

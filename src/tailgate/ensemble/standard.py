@@ -114,9 +114,8 @@ def search(job: Job, folder: Path, tell: Callable[[int, int, str, float], None] 
     """
     arena = job.arena
     hunt = Hunt(arena, BUDGETS[job.budget], job.seed, folder / "attacks" / job.name, tell, () if job.whole else UNLEARNED)
-    notes = _file(job, folder).with_suffix(".journal")
+    notes = _journal(job, folder)
     found = {one.member: one for one in harvest(hunt, journal.resume(notes, hunt), lambda out: journal.write(notes, hunt, out))}
-    notes.unlink(missing_ok=True)
     members = [found.get(one.name, Harvest(one.name, one.knowledge, [], ELSEWHERE)) for one in MEMBERS]
     return {
         "scenario": arena.name, "place": arena.scenario, "dose": arena.dose, "listed": _strongest(arena, job.listed),
@@ -154,6 +153,7 @@ def searched(
     def finish(number: int, result: dict[str, Any]) -> None:
         done[number] = result
         write_atomic(_file(jobs[number], folder), json.dumps(result, indent=1).encode() + b"\n")
+        _journal(jobs[number], folder).unlink(missing_ok=True)
         best = _best(result)
         text = f", {result['scenario']}: {best['damage']:.0%} by {best['attack']}" if best else ""
         update("searches", 100 * len(done), 100 * len(jobs), f"{len(done)} of {len(jobs)}{text}")
@@ -172,6 +172,11 @@ def searched(
             label = f"{jobs[i].arena.scenario}, dose {jobs[i].arena.dose}"
             finish(i, one(jobs[i], folder, lambda n, of, text, mean, label=label: update(label, n, of, text)))  # type: ignore[misc]
     return [done[i] for i in range(len(jobs))]
+
+
+def _journal(job: Job, folder: Path) -> Path:
+    """Return the file of what the members of a search have found so far."""
+    return _file(job, folder).with_suffix(".journal")
 
 
 def _note(job: Job, folder: Path) -> Path:

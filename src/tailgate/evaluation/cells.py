@@ -27,7 +27,7 @@ from tailgate.base.version import VERSION
 from tailgate.core import Attack, Defence, Model, draws
 from tailgate.core.foreign import with_place
 from tailgate.core.registry import Entry, Family, Spec, entry_for, text_of
-from tailgate.core.scenario import Scenario, ScenarioLike, Suite, load_scenario, load_suite
+from tailgate.core.scenario import Scenario, ScenarioLike, Suite, list_scenarios, load_scenario, load_suite
 from tailgate.core.schema import as_data, canonical
 from tailgate.core.threat import Brief
 from tailgate.engine.cards import DeviceError, device, playing_on
@@ -36,6 +36,7 @@ from tailgate.evaluation.frame import Rows
 from tailgate.evaluation.resume import complete
 from tailgate.evaluation.rounds import numbered
 from tailgate.evaluation.rows import packed
+from tailgate.evaluation.summary import ENTRY
 from tailgate.play.metrics import METRICS, Function, Own, measure, own_metric
 from tailgate.play.trace import Trace, episode_memory, episodes_at_once, rollout
 
@@ -153,8 +154,9 @@ def _head(cell: Cell, place: Scenario, defence: Entry, attack: Entry, identity: 
         "trained": origin(cell.attack) if identity else None, **({} if device() == "cpu" else {"device": device()}),
     }  # fmt: skip
     own = [own_metric(text).name for text in cell.metrics]
-    if taken := [name for name in own if name in (*head, *RESULT)]:
-        raise InputError("metric", taken[0], "a name that is no column of a row")
+    for i, name in enumerate(own):
+        if name in (*head, *RESULT, "metrics", *ENTRY) or name in own[:i]:
+            raise InputError("metric", name, "a name that no column of a row has, and no other metric")
     return head | ({"metrics": own} if own else {})
 
 
@@ -294,10 +296,20 @@ def _named(scenarios: Sequence[ScenarioLike]) -> dict[str, Scenario | None]:
     for one in scenarios:
         place = None if isinstance(one, str | Path) else load_scenario(one)
         name = str(one) if place is None else place.name
-        if name in out and place != out[name]:
-            raise InputError("scenarios", name, "scenarios of different names")
+        before = out.get(name)
+        same = place is before if place is None or before is None else place.config_hash == before.config_hash
+        if (name in out and not same) or (place is not None and _taken(place)):
+            raise InputError("scenarios", name, "a different name for each object, and no built-in scenario's or file's")
         out[name] = place
     return out
+
+
+def _taken(place: Scenario) -> bool:
+    """If a name belongs to a file, or to a built-in scenario that differs in more than its threat model: rows would name another one."""
+    if place.name not in list_scenarios():
+        return place.name.endswith(YAML_ENDS)
+    known = load_scenario(place.name)
+    return dataclasses.replace(place, threat_model=known.threat_model).config_hash != known.config_hash
 
 
 @known_arguments

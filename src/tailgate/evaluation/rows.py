@@ -33,7 +33,7 @@ _FIELDS: dict[str, Any] = {
     **{key: (_Text, ...) for key in KEYS}, **{name: (_Number, ...) for name in METRICS},
     "dose": (Annotated[int, Field(strict=True)] | None, ...), "seed": (Annotated[int, Field(strict=True)], ...),
     "status": (Literal["ok", "error", "skipped"], ...), "reason": (_Text, ""), "scenario_file": (_Text, ""), "uses": (list[_Text], ...),
-    "learned": (bool, ...), "optimal": (bool, ...),
+    "learned": (bool, ...), "optimal": (bool, ...), "metrics": (list[_Text], []),
 }  # fmt: skip
 _Row = create_model("Row", __config__=ConfigDict(extra="allow"), **_FIELDS)
 
@@ -78,6 +78,9 @@ def _row(line: bytes, where: str, damage: str, first: bool) -> Row:
     _check(row, where)
     if row["status"] == "ok" and row["crashed"] not in (0.0, 1.0):
         raise InputError(f"{where}: crashed", row["crashed"], "0 or 1")
+    for name in row.get("metrics", ()):
+        if name not in row or not isinstance(row[name], int | float | None) or isinstance(row[name], bool):
+            raise InputError(f"{where}: {name}", row.get(name), "a number or null: it is one of the row's metrics")
     return {intern(key): intern(value) if type(value) is str else value for key, value in row.items()}  # halves the memory
 
 

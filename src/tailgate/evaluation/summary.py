@@ -10,6 +10,7 @@ import numpy as np
 from tailgate.evaluation.rows import KEYS
 from tailgate.evaluation.stats import proportion
 
+ENTRY = ("n", "failed", "crash", "refused_all")  # keys of an entry that are no column of a row
 FIGURES = ("min_gap", "max_error", "rmse_position", "alarm_onsets", "alarm_rate", "attack_steps", "refused_commands")
 
 
@@ -37,8 +38,8 @@ def summarise(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         if good:
             share = proportion(sum(bool(r["crashed"]) for r in good), len(good))
             entry["crash"] = {"value": share.value, "low": share.low, "high": share.high}
-            for name in (*FIGURES, *good[0].get("metrics", ())):
-                values = np.array([r[name] for r in good if r[name] is not None], np.float64)
+            for name in (*FIGURES, *dict.fromkeys(name for r in good for name in r.get("metrics", ()) if name not in entry)):
+                values = np.array([r[name] for r in good if r.get(name) is not None], np.float64)
                 if len(values):
                     low, mid, high = np.quantile(values, [0.25, 0.5, 0.75])
                     entry[name] = {"median": float(mid), "q25": float(low), "q75": float(high)}

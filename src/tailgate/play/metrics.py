@@ -6,6 +6,8 @@ In a lane the nearer line takes the place of the car ahead, and the closing spee
 An estimate's error is that of the gap, or the norm of the whole state's error if there is no road (`Model.error`).
 """
 
+import inspect
+import warnings
 from collections.abc import Callable
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -313,14 +315,14 @@ def own_metric(text: str) -> Own:
         except Exception as error:  # whatever somebody's package does
             raise InputError("metric", text, f"an entry point that can be loaded ({with_place(error)})") from None
     elif ":" in text:
-        found = Own(text.partition(":")[2], attribute_of("metric", text, _plain_function, "function"))  # type: ignore[arg-type]
+        found = Own(text.partition(":")[2], attribute_of("metric", text, inspect.isfunction, "function"))  # type: ignore[arg-type]
     elif text in METRICS:
         raise InputError("metric", text, "one of your own: every row has this one")
     elif points:
         raise unknown("metric", text, points)
     else:
         raise InputError("metric", text, "module:function, or the name of an entry point of the group tailgate.metrics")
-    if not _plain_function(found.function):
+    if not inspect.isfunction(found.function):
         raise InputError("metric", text, "a function of a trace")
     if METRICS.get(found.name, found.function) is not found.function:
         raise InputError("metric", text, "a name that is not taken")
@@ -328,12 +330,14 @@ def own_metric(text: str) -> Own:
 
 
 def own_metrics() -> list[Own]:
-    """Return the metrics of all entry points."""
-    return [own_metric(name) for name in sorted(_points())]
-
-
-def _plain_function(value: object) -> bool:
-    return callable(value) and not isinstance(value, type)
+    """Return the metrics of all entry points; one that cannot be loaded is a warning."""
+    out = []
+    for name in sorted(_points()):
+        try:
+            out.append(own_metric(name))
+        except InputError as error:  # of a package that nobody asked for
+            warnings.warn(str(error), stacklevel=2)
+    return out
 
 
 @cache

@@ -168,8 +168,9 @@ def _meant(recording: Recording, name: str) -> None:
             continue
         both = part.seen[wide:] & part.seen[:-wide]
         total = np.concatenate([[0.0], np.cumsum(0.5 * (part.relative_speed[1:] + part.relative_speed[:-1]) * recording.dt)])
-        rate.append((part.gap[wide:] - part.gap[:-wide])[both])
-        told.append((total[wide:] - total[:-wide])[both])
+        over = wide * recording.dt
+        rate.append((part.gap[wide:] - part.gap[:-wide])[both] / over)
+        told.append((total[wide:] - total[:-wide])[both] / over)
     x, y = np.concatenate([np.zeros(0), *told]), np.concatenate([np.zeros(0), *rate])
     if len(x) < 20:
         return
