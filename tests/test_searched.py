@@ -44,7 +44,7 @@ defences: [none, chi2_kf, stand_still]
 attacks: [none, 'noise_jam:start_step=10']
 seeds: 8
 threat: {delay_bound: 60.0}
-adaptive: {ensemble: quick, doses: [4], scenarios: [radar-braking-v0]}
+adaptive: {ensemble: quick, doses: [4]}
 """
 
 
@@ -161,7 +161,7 @@ def test_a_rank_asks_for_the_searches(made: tuple[Path, Path]) -> None:
     ],
 )  # fmt: skip
 def test_plans_that_cannot_be_kept_are_refused(plan: str, words: str, tmp_path: Path) -> None:
-    (tmp_path / "s.yaml").write_text(TEXT.replace("{ensemble: quick, doses: [4], scenarios: [radar-braking-v0]}", plan))
+    (tmp_path / "s.yaml").write_text(TEXT.replace("{ensemble: quick, doses: [4]}", plan))
     with pytest.raises(InputError, match=words):
         load_suite(str(tmp_path / "s.yaml"))
 

@@ -51,7 +51,7 @@ def attack(
         groups.setdefault((fitting(suite, config), ""), []).extend(map(str, policies_of(config)))
     if plan.ensemble:
         found = search(suite, defence, out, beacon=beacon, workers=workers, progress=progress, announce=announce)
-        for scenario, texts in attacks_of(found, plan.scenarios).items():
+        for scenario, texts in attacks_of(found).items():
             groups[(scenario,), "-found" if configs else ""] = [text for text in texts if text not in suite.attacks]
         groups = {key: texts for key, texts in groups.items() if texts}
     files, count, counted = [], 0, counting(progress)

@@ -1,6 +1,6 @@
 """Attacks that the standard ensemble finds against a defence: a board asks for them before it ranks.
 
-The suite's plan names a budget. Every scenario is searched, at the plan's doses; those who learn may search in the plan's scenarios only.
+The suite's plan names a budget. Every scenario is searched, at the plan's doses; those who learn leave out scenarios for robustness.
 Of each search the best attack of every class of knowledge is played, in that scenario at all doses (`attacks_of`). The results lie with
 the rows, and the board holds them, so that it can be scored without them.
 """
@@ -60,7 +60,7 @@ def search(
     plan = plan_of(suite)
     if set(str(out)) & set(MARKS):
         raise InputError("--out", str(out), f"a path without any of {MARKS}, as the texts of attacks hold it")
-    jobs = jobs_of(suite, defence, (), plan.searched(suite), plan.ensemble, seed_of(beacon), plan.scenarios)
+    jobs = jobs_of(suite, defence, (), plan.searched(suite), plan.ensemble, seed_of(beacon), suite.nominal)
     spec = Spec("defence", defence)
     folder = writable_directory(out / "searches" / stem(defence))
     with alone(folder):
@@ -118,16 +118,14 @@ def _placed(text: str, folder: Path) -> str:
     return f"{head}{folder / source.name}"
 
 
-def attacks_of(line: Data, whole: Collection[str] = ()) -> dict[str, list[str]]:
-    """Return the attacks of a line that are played, by scenario: where they were found.
-
-    whole: the scenarios where all members searched; what was found there is played in the others too. Empty: all members searched in all.
-    """
+def attacks_of(line: Data) -> dict[str, list[str]]:
+    """Return the attacks of a line that are played, by scenario: where they were found, and where not all members searched."""
     out: dict[str, list[str]] = {cell["scenario"]: [] for cell in line["cells"]}
+    light = {cell["scenario"] for cell in line["cells"] for one in cell["members"] if one["why"] == standard.ELSEWHERE}
     for cell in line["cells"]:
         found, origin = [one["attack"] for one in cell["members"] if one["attack"] is not None], cell["scenario"]
         for name in out:
-            if name == origin or (origin in whole and name not in whole):
+            if name == origin or (name in light and origin not in light):
                 out[name] += [attack for attack in found if attack not in out[name]]
     return out
 
@@ -173,14 +171,14 @@ def unsearched(table: Table, row: Row, searches: Sequence[Data], plan: Adaptive)
     for name, value in own.items():
         if line[name] != value:
             return f"the ensemble attacked another {name}: {line[name] or 'none'}, not {value or 'none'}"
-    cells, asked = {(cell["scenario"], cell["dose"]): cell for cell in line["cells"]}, attacks_of(line, plan.scenarios)
+    cells, asked = {(cell["scenario"], cell["dose"]): cell for cell in line["cells"]}, attacks_of(line)
     index = table.defences.index(row["defence"])
     for name in table.scenarios:
         for dose in plan.searched(suite):
             cell = cells.get((name, dose))
             if cell is None:
                 return f"the ensemble has not attacked it on {name} at dose {dose}"
-            if lacks := _lacking(cell, not plan.scenarios or name in plan.scenarios):
+            if lacks := _lacking(cell, name in suite.nominal):
                 return f"the search on {name} at dose {dose} is not whole: {lacks}"
         here = {attack for cell in line["cells"] if cell["scenario"] == name for one in cell["members"] if (attack := one["attack"])}
         left = set(asked[name]) - table.withdrawn

@@ -38,11 +38,7 @@ class Adaptive:
     """The field `adaptive` of a suite."""
 
     config: str = param("", "preset of the training")
-    scenarios: tuple[str, ...] = param(
-        (),
-        "the suite's scenarios where learners train (none: the first), one of each kind of system, or where the whole ensemble searches "
-        "(none: all)",
-    )
+    scenarios: tuple[str, ...] = param((), "the suite's scenarios that are trained on; none: the first. One of each kind of system")
     dose: PositiveCount | None = param(None, "attack budget in training [steps]; none: the scenario's own")
     changes: tuple[str, ...] = param((), "key=value changes of the preset, for all learners")
     learners: dict[str, tuple[str, ...]] = field(default_factory=dict, metadata={"doc": "learners, each with its own changes"})
