@@ -202,11 +202,13 @@ def cell_id(cell: Cell) -> str:
 
 
 def _code(value: type | Function) -> str:
-    """Return the hash of the file that defines somebody's class or function; empty for one of this package, or without a file."""
+    """Return the hash of the file that defines somebody's class or function, of its own source in a notebook; empty for this package's."""
     if value.__module__.partition(".")[0] == "tailgate":
         return ""
     with contextlib.suppress(OSError, TypeError):
         return hashlib.sha256(Path(inspect.getfile(value)).read_bytes()).hexdigest()
+    with contextlib.suppress(OSError, TypeError):
+        return hashlib.sha256(inspect.getsource(value).encode()).hexdigest()
     return ""
 
 
