@@ -10,7 +10,7 @@ pytest.importorskip("matplotlib")
 from PIL import Image
 
 from tailgate import cli
-from tailgate.base.plots import matrices, scatter, write_overview
+from tailgate.base.plots import matrix_figure, png, scatter_figure, write_overview
 
 
 def entry(defence, attack, rmse, gap, crash, scenario="s", dose=5):
@@ -42,7 +42,7 @@ def test_the_pictures_show_the_figures():
     """Another number gives another picture, the same table the same bytes."""
     good = [e for e in TABLE if e["crash"]]
     other = [entry("a", "x", 0.5, 10.0, 0.9), *good[1:]]
-    for draw in (lambda table: matrices(table, "t"), scatter):
+    for draw in (lambda table: png(matrix_figure(table, "t")), lambda table: png(scatter_figure(table))):
         assert draw(good) == draw(good)
         one, two = shown(draw(good)), shown(draw(other))
         assert one.shape != two.shape or (one != two).any()
