@@ -202,7 +202,7 @@ def cell_id(cell: Cell) -> str:
 
 
 def _code(value: type | Function) -> str:
-    """Return the hash of the file that defines somebody's class or function, of its own source in a notebook; empty for this package's."""
+    """Return the hash of the file that defines somebody's class or function, or of the source in a notebook; empty for this package's."""
     if value.__module__.partition(".")[0] == "tailgate":
         return ""
     with contextlib.suppress(OSError, TypeError):
