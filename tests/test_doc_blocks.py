@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,14 @@ PAGES = (
     "README.md", "docs/automata.md", "docs/engine.md", "docs/guide.md", "docs/highway.md", "docs/lane-keeping.md", "docs/rendering.md",
     "docs/submissions.md", "docs/two-players.md",
 )  # fmt: skip
+NEEDED = {  # what the reader of a page has made already, in a small form
+    "docs/falsification.md": ["falsify", "kf", "--property", "G[0,60] gap > 20", "--scenario", "braking-v0", "--attack", "none", "--trials", "2", "--out", "found"],
+    "docs/logs.md": [
+        "log", "--suite", "car-following-v0", "--scenario", "gusty-stop-and-go-v0", "--attack", "none", "--episodes", "1", "--dev-episodes", "1",
+        "--out", "out/log",
+    ],
+    "docs/scoring.md": ["evaluate", "--suite", "quick-v1", "--defence", "kf", "--attack", "none", "--seeds", "2", "--out", "rows.jsonl"],
+}  # fmt: skip
 
 
 def blocks(page: str) -> list[str]:
@@ -32,3 +41,27 @@ def test_the_blocks_of_a_page_run(page: str, tmp_path: Path) -> None:
     quiet = os.environ | {"SDL_VIDEODRIVER": "dummy"}  # windows without a screen
     done = subprocess.run([sys.executable, "page.py"], cwd=tmp_path, env=quiet, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.thin(3)
+@pytest.mark.parametrize("page", [*NEEDED, "docs/gpu.md", "docs/leaderboard-page.md", "docs/replay.md"])
+def test_the_blocks_of_a_page_run_on_what_its_reader_has(page: str, tmp_path: Path) -> None:
+    for needed in ("pyarrow", "pygame", "highway_env", "optuna", "torch"):
+        pytest.importorskip(needed)
+    code = "\n".join(blocks(page)).replace('"cuda"', '"cpu"')
+    if page == "docs/replay.md" and not find_spec("moviepy"):
+        code = code.replace('env = gymnasium.wrappers.RecordVideo(env, "films")', "")
+    (tmp_path / "results").symlink_to(ROOT / "results")
+    (tmp_path / "page.py").write_text(code, encoding="utf-8")
+    before = [["-m", "tailgate", *NEEDED[page]]] if page in NEEDED else []
+    for words in [*before, ["page.py"]]:
+        quiet = os.environ | {"SDL_VIDEODRIVER": "dummy"}
+        done = subprocess.run([sys.executable, *words], cwd=tmp_path, env=quiet, capture_output=True, text=True, timeout=300, check=False)
+        assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.long
+def test_the_script_of_docs_distributed_prints_its_table(tmp_path: Path) -> None:
+    (tmp_path / "table.py").write_text(blocks("docs/distributed.md")[0], encoding="utf-8")
+    done = subprocess.run([sys.executable, "table.py", "1", "thesis-ch5-v0"], cwd=tmp_path, capture_output=True, text=True, timeout=600, check=True)
+    assert len(done.stdout.splitlines()) == 16 and all(line.count("|") == 7 for line in done.stdout.splitlines())
