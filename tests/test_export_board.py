@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tailgate.board.export import FORMATS, SPECIAL, TITLE, escaped, exported
+from tailgate.board.export import COLUMNS, FORMATS, SPECIAL, TITLE, escaped, exported
 from tailgate.board.files import load
 from tailgate.board.head import lines
 from tailgate.cli import main
@@ -15,11 +15,29 @@ from tailgate.cli import main
 FILE = Path(__file__).parents[1] / "results" / "quick-v1" / "board.json.xz"
 
 
-def test_csv_has_the_head_cell_for_cell() -> None:
-    board = load(FILE)
-    rows = list(csv.reader(io.StringIO(exported(board, "csv").decode())))
-    assert rows == [list(line) for line in lines(board)]
-    assert len(list(csv.reader(io.StringIO(exported(board, "csv", 3).decode())))) == 4
+def _csv(name: str, most: int | None = None) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(exported(load(FILE.parents[1] / name / "board.json.xz"), "csv", most).decode())))
+
+
+def test_csv_has_the_figures_of_the_head_as_numbers() -> None:
+    """For each dose and each knowledge; in the order of the page."""
+    rows = [row for row in _csv("radar-v1") if row["knowledge"] == "black" and row["status"] == "ranked"]
+    head = lines(load(FILE.parents[1] / "radar-v1/board.json.xz"))
+    assert len(rows) == 3 * 14 and set(rows[0]) == set(COLUMNS)
+    for k, line in enumerate(head[1:15]):
+        own, shown = rows[3 * k : 3 * k + 3], dict(zip(head[0], line, strict=True))
+        assert {row["defence"] for row in own} == {shown["defence"]} and {row["class"] for row in own} == {shown["class"]}
+        for row in own:
+            assert shown[f"undamaged at {row['dose']}"].startswith(f"{100 * float(row['undamaged']):.0f} % (at least ")
+            assert 0.0 <= float(row["undamaged_low"]) <= float(row["undamaged"]) and row["worst_attack"]
+        middle = own[1]
+        none, impact = shown["no attack damages at 4"], shown["impact at 4 [m/s]"]
+        assert none.startswith(f"{100 * float(middle['no_attack_damages']):.0f} %") and shown["gap"] == f"{100 * float(middle['mean_gap']):+.1f} %"
+        assert impact == (f"{float(middle['impact_mean']):.3g} (90 %: {float(middle['impact_q90']):.3g})" if middle["impact_mean"] else "-")
+
+
+def test_csv_of_few_defences() -> None:
+    assert len({row["defence"] for row in _csv("quick-v1", 3)}) == 3
 
 
 def test_latex_is_a_table_without_a_bare_special_character() -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from tailgate.board.gates import explained
 from tailgate.board.trial import published
 from tailgate.cli import main
 from tailgate.core.scenario import list_suites, load_suite
@@ -86,12 +87,23 @@ def test_boards_that_are_shipped_are_of_their_suites() -> None:
 def test_a_class_that_fails_in_every_episode_is_one_error(
     small_ensemble: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It names the line of the class; no page is made."""
+    """It names the line of the class; no page is made. Attacks that the suite does not grant are skipped, and change nothing."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    Path("suite-v1.yaml").write_text(SUITE)
+    Path("suite-v1.yaml").write_text(SUITE.replace("[none, 'noise", "[none, 'replay:start_step=10', 'noise"))
     Path("broken_defence.py").write_text(CLASS.replace("    pass", "    def step(self, *arguments):\n        return 1 / 0"))
     assert main(["leaderboard", "try", "broken_defence:Mine", "--suite", "suite-v1.yaml", "--quiet", "--workers", "1"]) == 2
     error = capsys.readouterr().err
     assert "expected a class that plays an episode to its end (ZeroDivisionError" in error and "broken_defence.py, line 6" in error
     assert not list(Path("tried").glob("**/index.html"))
+
+
+def test_a_class_without_a_rank_is_told_each_gate_that_it_fails() -> None:
+    found = [
+        {"gate": "gap", "scenario": "a", "value": 0.4, "limit": 0.1, "passed": False},
+        {"gate": "false alarms", "scenario": "b", "value": 0.98, "limit": 0.5, "passed": False},
+        {"gate": "jerk", "scenario": "a", "value": 1.0, "limit": 1.2, "passed": True},
+    ]
+    gap, alarms = explained(found)
+    assert gap == "gate gap, a: 0.4, limit 0.1: by how much the mean gap is longer than that of the undefended car, as a share of it"
+    assert alarms.startswith("gate false alarms, b: 0.98, limit 0.5: share of the time") and "tailgate calibrate" in alarms

@@ -6,7 +6,7 @@ import numpy as np
 
 from tailgate.base.errors import InputError
 from tailgate.core import Array, Estimate, Mode, Model, param
-from tailgate.core.quantities import Accel, Lag, Length, PositiveGain, PositiveSpeed, check_order
+from tailgate.core.quantities import Accel, Headway, Length, PositiveGain, PositiveSpeed, check_order
 from tailgate.core.registry import register
 
 LEADER = ("leader_position", "leader_velocity")  # the leader's message
@@ -62,7 +62,7 @@ class AdaptiveCruise(OneCar):
     without the gap term, (v_set - v_f) / h, is taken (speed mode).
     """
 
-    headway: Lag = param(3.0, "time headway h [s]")
+    headway: Headway = param(3.0, "time headway h [s]")
     standstill: Length = param(5.0, "minimum stopping distance d_r [m]")
     gamma: PositiveGain = param(0.9, "gap gain [1/s]")
     set_speed: PositiveSpeed | None = param(29.95, "driver's set speed [m/s]; none: spacing mode only")

@@ -18,7 +18,7 @@ import numpy as np
 from tailgate import num
 from tailgate.base.errors import InputError
 from tailgate.core import Array, Estimate, Mode, Model, Probability, param
-from tailgate.core.quantities import Accel, Gain, Lag, Length, check_order
+from tailgate.core.quantities import Accel, Gain, Headway, Length, check_order
 from tailgate.core.registry import register
 from tailgate.envs.controllers.adaptive_cruise import WIDEN_FACTOR, limited, obeyed
 
@@ -92,7 +92,7 @@ class Law:
     error_gains: ClassVar[tuple[str, ...]] = ()
     rate_gains: ClassVar[tuple[str, ...]] = ()
 
-    headway: Lag = param(3.0, "time headway tau_h [s]")
+    headway: Headway = param(3.0, "time headway tau_h [s]")
     standstill: Length = param(5.0, "minimum stopping distance d_r [m]")
     accel_min: Accel | None = param(-8.0, "lower limit of the command [m/s^2]; none: unlimited")
     accel_max: Accel | None = param(3.0, "upper limit of the command [m/s^2]; none: unlimited")

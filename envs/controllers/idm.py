@@ -10,7 +10,7 @@ import numpy as np
 
 from tailgate import num
 from tailgate.core import Array, Estimate, Model, param
-from tailgate.core.quantities import Lag, Length, PositiveSpeed, Rate
+from tailgate.core.quantities import Headway, Length, PositiveSpeed, Rate
 from tailgate.core.registry import register
 from tailgate.envs.controllers.adaptive_cruise import OneCar, limited, obeyed, widened
 from tailgate.envs.controllers.radar_car import GAP, RELATIVE_SPEED, check_radar_car
@@ -84,7 +84,7 @@ class IntelligentDriver(OneCar):
     """
 
     set_speed: PositiveSpeed = param(29.95168, "desired speed v0 [m/s]; 67 mph")
-    headway: Lag = param(3.0, "desired time headway T [s]")
+    headway: Headway = param(3.0, "desired time headway T [s]")
     standstill: Length = param(5.0, "gap at standstill s0 [m]")
     accel: Rate = param(1.4, "largest acceleration [m/s^2]")
     decel: Rate = param(2.0, "comfortable deceleration b [m/s^2]")

@@ -19,7 +19,7 @@ import numpy as np
 from tailgate import num
 from tailgate.base.errors import InputError
 from tailgate.core import Array, Estimate, Model, param
-from tailgate.core.quantities import Lag, Length, PositiveGain, PositiveSpeed, Time
+from tailgate.core.quantities import Headway, Length, PositiveGain, PositiveSpeed, Time
 from tailgate.core.registry import register
 from tailgate.envs.controllers.adaptive_cruise import obeyed, widened
 from tailgate.envs.controllers.emergency import BrakeState, EmergencyBrake
@@ -118,7 +118,7 @@ class ProductionCruise:
     With `aeb` an emergency brake (emergency.py) acts on the same estimates, beyond these limits.
     """
 
-    headway: Lag = param(1.2, "time gap h [s]")
+    headway: Headway = param(1.2, "time gap h [s]")
     standstill: Length = param(3.5, "gap at standstill d_0 [m]")
     gap_gain: PositiveGain = param(0.145, "gain of the gap k_g [1/s^2]")
     speed_gain: PositiveGain = param(0.38, "gain of the relative speed k_v [1/s]")

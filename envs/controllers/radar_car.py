@@ -6,7 +6,7 @@ import numpy as np
 
 from tailgate.base.errors import InputError
 from tailgate.core import Array, Estimate, Model, Plant, Receiver, Sensor, param
-from tailgate.core.quantities import Accel, Lag, Length, PositiveGain, PositiveSpeed, check_order
+from tailgate.core.quantities import Accel, Headway, Lag, Length, PositiveGain, PositiveSpeed, check_order
 from tailgate.core.registry import register
 from tailgate.envs.controllers.adaptive_cruise import OneCar, limited, obeyed, widened
 
@@ -60,7 +60,7 @@ class RadarCruise(OneCar):
     Erratum: the "1/k" of (3.13) is a constant gain g [1/s], not the time index.
     """
 
-    headway: Lag = param(3.0, "time headway tau_h [s]")
+    headway: Headway = param(3.0, "time headway tau_h [s]")
     standstill: Length = param(5.0, "minimum stopping distance d0 [m]")
     g: PositiveGain = param(0.9, "gap gain [1/s]")
     tau: Lag = param(1.008, "time constant TL [s]")

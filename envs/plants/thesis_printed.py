@@ -16,7 +16,7 @@ import numpy as np
 
 from tailgate import num
 from tailgate.core import Array, Estimate, Model, param
-from tailgate.core.quantities import Lag, Length, PositiveGain
+from tailgate.core.quantities import Headway, Length, PositiveGain
 from tailgate.core.registry import register
 from tailgate.envs.controllers.adaptive_cruise import OneCar
 from tailgate.envs.plants.car_following import CarFollowing, FollowingPlan
@@ -27,7 +27,7 @@ from tailgate.envs.plants.car_following import CarFollowing, FollowingPlan
 class CarFollowingLiteral(CarFollowing):
     """The thesis's matrices as printed. The public model has A_d: the filter is not told when the car accelerates."""
 
-    headway: Lag = param(3.0, "time headway h [s]")
+    headway: Headway = param(3.0, "time headway h [s]")
     gamma: PositiveGain = param(0.9, "gap gain [1/s]")
 
     def dynamics(self) -> tuple[Array, Array]:
@@ -50,7 +50,7 @@ class CarFollowingLiteral(CarFollowing):
 class RelativeDistance(OneCar):
     """Feeds the printed model: u = x_l - x_f [m], the follower's position as estimated."""
 
-    headway: Lag = param(3.0, "time headway h of the spacing policy (4.13) [s]")
+    headway: Headway = param(3.0, "time headway h of the spacing policy (4.13) [s]")
     standstill: Length = param(5.0, "minimum stopping distance d_r [m]")
 
     def prepare(self, model: Model) -> None:

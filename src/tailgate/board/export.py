@@ -1,4 +1,4 @@
-"""A board for a paper: its head as CSV or LaTeX, its figure as vectors, and how to cite it."""
+"""A board for a paper: its figures as CSV, its head as LaTeX, a picture as vectors, and how to cite it."""
 
 from __future__ import annotations
 
@@ -29,6 +29,11 @@ SPECIAL = {
 }  # fmt: skip
 SIGNS = {"<=": r"$\leq$", ">=": r"$\geq$"}
 TITLE = "Tailgate: a benchmark in which an adversary learns when to attack the sensors of adaptive cruise control"  # as in CITATION.cff
+COLUMNS = (
+    "defence", "class", "status", "rank_best", "rank_worst", "knowledge", "dose", "undamaged", "undamaged_low", "attacks", "worst_scenario",
+    "worst_attack", "no_attack_damages", "no_attack_damages_low", "no_attack_damages_high", "impact_mean", "impact_q90", "distance_kept",
+    "distance_kept_least", "critical_dose", "critical_dose_low", "critical_dose_high", "mean_gap",
+)  # fmt: skip
 DRAWN = 8  # defences with a colour in the figure; the others are grey
 
 
@@ -40,8 +45,8 @@ def exported(board: Data, form: str, most: int | None = None) -> bytes:
     board
         JSON data of a board.
     form
-        csv and latex: the head, a line for each defence; bibtex: an entry for the board and one for the thesis; svg and pdf: damage by
-        dose under the worst black-box attack.
+        csv: numbers, a line for each defence, dose and knowledge (`COLUMNS`); latex: the head, a line for each defence; bibtex: an entry
+        for the board and one for the thesis; svg and pdf: damage by dose under the worst black-box attack.
     most
         At most this many defences, in the order of the page; by default all.
 
@@ -58,14 +63,32 @@ def exported(board: Data, form: str, most: int | None = None) -> bytes:
         return _bibtex(board).encode()
     if form in ("svg", "pdf"):
         return _figure(board, form, most)
+    if form == "csv":
+        return _csv(ordered(read_board(board).entries)[:most])
     head, *body = lines(board)
-    shown = [head, *body[:most]]
-    return _csv(shown) if form == "csv" else _latex(board, shown).encode()
+    return _latex(board, [head, *body[:most]]).encode()
 
 
-def _csv(shown: list[tuple[str, ...]]) -> bytes:
+def _csv(entries: Sequence[Entry]) -> bytes:
+    """Return a line for each defence, dose and knowledge; an empty cell where there is no figure, or a dose beyond the largest."""
     out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows(shown)
+    table = csv.writer(out, lineterminator="\n")
+    table.writerow(COLUMNS)
+    for entry in entries:
+        pointwise = {(line.dose, line.knowledge): line.undamaged for line in entry.pointwise}
+        attacked = {(line.dose, line.knowledge): line for line in entry.under_attack}
+        for rate in entry.rates:
+            at = (rate.dose, rate.knowledge)
+            held, none, harm, dose = rate.undamaged, pointwise.get(at), attacked.get(at), entry.critical_dose.get(rate.knowledge)
+            table.writerow([
+                entry.defence, entry.class_, entry.status, *([entry.rank.best, entry.rank.worst] if entry.rank else ["", ""]),
+                rate.knowledge, rate.dose, *([held.value, held.low] if held else ["", ""]), rate.attacks,
+                *([rate.worst.scenario, rate.worst.attack] if rate.worst else ["", ""]),
+                *([none.value, none.low, none.high] if none else [""] * 3),
+                *([harm.severity.mean, harm.severity.q90, harm.availability] if harm else [""] * 3),
+                harm.least.value if harm and harm.least else "", *([dose.value, dose.low, dose.high] if dose else [""] * 3),
+                entry.mean_gap.value if entry.mean_gap else "",
+            ])  # fmt: skip
     return out.getvalue().encode()
 
 
@@ -80,7 +103,8 @@ def _latex(board: Data, shown: list[tuple[str, ...]]) -> str:
     kept, name = filled_columns(board, shown), re.sub(r"[^A-Za-z0-9]+", "-", board["suite"]["name"]).strip("-")
     rows = [" & ".join(escaped(line[i]) for i in kept) + r" \\" for line in shown]
     return "\n".join([
-        r"\begin{table}", r"\centering", rf"\caption{{{escaped(title(board))}}}", rf"\label{{tab:tailgate-{name}}}",
+        r"% needs \usepackage{booktabs}", r"\begin{table}", r"\centering", rf"\caption{{{escaped(title(board))}}}",
+        rf"\label{{tab:tailgate-{name}}}",
         rf"\begin{{tabular}}{{{'l' * len(kept)}}}", r"\toprule",
         rows[0], r"\midrule", *rows[1:], r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
     ])  # fmt: skip
@@ -93,7 +117,7 @@ def _bibtex(board: Data) -> str:
   title = {{{TITLE}. Board {escaped(held.name)}}},
   author = {{{{The Tailgate developers}}}},
   year = {{2026}},
-  note = {{Version {escaped(str(held.version))}, suite {escaped(held.hash)}}},
+  note = {{Played with version {escaped(str(held.version))}, suite {escaped(held.hash)}}},
 }}
 
 @phdthesis{{dutta-2018,

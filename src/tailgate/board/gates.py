@@ -26,6 +26,16 @@ ALARMED = 0.5  # share of the time
 ALARMS = ("alarm_rate", "alarm_onsets")  # figures that a clean run is judged by
 COSTS = ("time_gap_inflation", "rms_jerk", "distance_travelled")
 
+MEANS = {  # a gate, what its figure is, without an attack
+    "gap": "by how much the mean gap is longer than that of the undefended car, as a share of it",
+    "jerk": "RMS jerk over that of the undefended car",
+    "progress": "distance over that of the undefended car",
+    "every episode": f"share of the episodes with {FAR:.0%} of the distance of the undefended car",
+    "collisions": "damaged episodes",
+    "bound": "damaged episodes",
+    "false alarms": "share of the time with an alarm (`tailgate calibrate` sets thresholds)",
+}
+
 Gate = dict[str, Any]
 
 
@@ -80,6 +90,12 @@ def _worse(of: Callable[[float, float], float], values: list[float]) -> float | 
 
 def _gate(name: str, scenario: str, value: float | None, limit: float | None, passed: bool) -> Gate:
     return {"gate": name, "scenario": scenario, "value": value, "limit": limit, "passed": passed}
+
+
+def explained(found: list[Gate]) -> list[str]:
+    """Return a line for each gate that is not passed, with its figure and what the figure is."""
+    missed = [gate for gate in found if not gate["passed"] and gate["value"] is not None]
+    return [f"gate {g['gate']}, {g['scenario']}: {g['value']:.3g}, limit {g['limit']:g}: {MEANS[g['gate']]}" for g in missed]
 
 
 def failure(found: list[Gate]) -> str:

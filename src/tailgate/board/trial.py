@@ -87,7 +87,7 @@ def try_out(
         say(f"now the attacks on {defence}, as {entry['why']}")
         attack(
             suite, defence, folder / "attacked", workers=workers, progress=progress,
-            announce=lambda seconds: say(f"the searches take about {lasting(seconds)}"),
+            announce=lambda seconds: say(f"the searches take about {lasting(seconds)} where nothing else runs"),
         )  # fmt: skip
         made = board_of(suite, folder, keep=keep, provisional=[defence])
         entry = _entry(made, defence)
@@ -95,8 +95,8 @@ def try_out(
 
 
 def _played(folder: Path, defence: str) -> None:
-    """Raise InputError for a class that failed in every episode: it has no figure, and its page would have none."""
-    rows = [row for path in files_of_rows(folder) for row in read_rows(path) if row["defence"] == defence]
+    """Raise InputError for a class that failed in every clean episode: it has no figure, and its page would have none."""
+    rows = [row for path in files_of_rows(folder) for row in read_rows(path) if row["defence"] == defence and row["attack"] == "none"]
     if rows and all(row["status"] == "error" for row in rows):
         raise InputError("defence", defence, f"a class that plays an episode to its end ({rows[0]['reason']})")
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from tailgate.cli.shared import Commands, add_options, own_classes, say, show, table, threat_of, working
+from tailgate.cli.shared import Commands, add_options, own_classes, played_by, say, show, table, threat_of, working
 
 
 def add(commands: Commands) -> None:
@@ -56,3 +56,5 @@ def _print(report: dict[str, Any]) -> None:
         f"{100 * lost['value']:+.1f} points [{100 * lost['low']:+.1f}, {100 * lost['high']:+.1f}]"
     )
     say(f"written to {report['file']}")
+    again = played_by(report["scenario"], report["defence"], f"rules:path={report['file']}", report["threat"])
+    say(f"to play them: {again}", soft_wrap=True)

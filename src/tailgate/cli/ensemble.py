@@ -51,26 +51,27 @@ def _attack(options: argparse.Namespace) -> int:
         report = attack(
             load_suite(options.suite), options.defence, scenarios=options.scenario or (), doses=doses, budget=options.budget,
             seed=options.seed, episodes=options.episodes, workers=options.workers, out=out, progress=update,
-            announce=lambda seconds: tell(f"the searches take about {lasting(seconds)}"),
+            announce=lambda seconds: tell(f"the searches take about {lasting(seconds)} where nothing else runs"),
         )  # fmt: skip
     if out is not None:
         write_atomic(out / "attacks.txt", "".join(f"{text}\n" for text in attacks_of(report)).encode())
     show(options, report, _print)
     if not options.json and (again := _again(report, options.suite, kept=out is not None)):
-        say(f"to play the most harmful one again: {again}", soft_wrap=True)
+        say(again, soft_wrap=True)
     return 0
 
 
 def _again(report: dict[str, Any], suite: str, kept: bool) -> str:
-    """Return the command that plays the most harmful attack, empty where there is none or its file is gone."""
+    """Return the command that plays the most harmful attack, or why there is none; empty where nothing was found."""
     found = [(one["damage"], cell, one["attack"]) for cell in report["cells"] for one in cell["members"] if one["attack"]]
-    found = [one for one in found if kept or "path=" not in one[2]]
     if not found:
         return ""
-    _, cell, attack = max(found, key=lambda one: one[0])
+    damage, cell, attack = max(found, key=lambda one: one[0])
+    if not kept and "path=" in attack:
+        return f"the most harmful one ({damage:.1%} in {cell['scenario']}) is a file, and no file was kept: --out DIR keeps them"
     words = ["tailgate", "evaluate", "--suite", suite, "--scenario", cell["scenario"]]
     words += ["--dose", "none" if cell["dose"] is None else str(cell["dose"]), "--defence", report["defence"], "--attack", attack]
-    return shlex.join([*words, "--out", "rows.jsonl"])
+    return f"to play the most harmful one again: {shlex.join([*words, '--out', 'rows.jsonl'])}"
 
 
 def _print(report: dict[str, Any]) -> None:

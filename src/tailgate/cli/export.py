@@ -14,8 +14,8 @@ def add(actions: Commands) -> None:
     """Add `export` to the actions of `leaderboard`."""
     command = actions.add_parser(
         "export", help="write a board for a paper: CSV, LaTeX, BibTeX, SVG or PDF",
-        description="Write the head of a board as CSV or as a LaTeX table (booktabs), how to cite it as BibTeX, or damage by dose as a "
-        "picture. Example: tailgate leaderboard export results/quick-v1/board.json.xz --format latex --most 14",
+        description="Write the figures of a board as CSV, its head as a LaTeX table (booktabs), how to cite it as BibTeX, or damage by "
+        "dose as a picture. Example: tailgate leaderboard export results/quick-v1/board.json.xz --format latex --most 14",
     )  # fmt: skip
     command.add_argument("board", metavar="FILE", help="board.json, or board.json.xz")
     command.add_argument("--format", required=True, metavar="FORM", help="csv, latex, bibtex, svg or pdf")

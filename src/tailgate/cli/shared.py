@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import secrets
+import shlex
 import sys
 from collections.abc import Callable, Container, Iterable, Sequence
 from contextlib import AbstractContextManager
@@ -82,6 +83,14 @@ def values(option: str, texts: Iterable[str], example: str = "") -> dict[str, An
 def threat_of(options: argparse.Namespace) -> dict[str, Any]:
     """Return the changes of a threat model that --threat gives."""
     return values("--threat", options.threat, ", for example fdi_bound=10")
+
+
+def played_by(scenario: str, defence: str, attack: str, threat: dict[str, Any]) -> str:
+    """Return the command that plays an attack on a defence in a scenario, under these changes of its threat model."""
+    words = ["tailgate", "evaluate", "--scenario", scenario, "--defence", defence, "--attack", attack]
+    for key, value in threat.items():
+        words += ["--dose", str(value)] if key == "budget" and value is not None else ["--threat", f"{key}={json.dumps(value)}"]
+    return shlex.join(words)
 
 
 def picture(option: str, text: str) -> Path:

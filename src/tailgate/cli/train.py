@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +14,7 @@ from rich.console import Console
 from tailgate.base.errors import InputError
 from tailgate.base.locks import alone
 from tailgate.base.progress import cells, progress
-from tailgate.cli.shared import Commands, add_options, own_classes, print_json, say, table, tell
+from tailgate.cli.shared import Commands, add_options, own_classes, played_by, print_json, say, table, tell
 
 if TYPE_CHECKING:
     from tailgate.agents.learners.learning import Progress
@@ -101,16 +100,9 @@ def _train(options: argparse.Namespace) -> int:
     if report["advantage"]["no attack"]["value"] <= 0.0:
         tell(_harmless(config, max(report["decisions"])))
     errors.print(f"policy: {', '.join(str(p) for p in policies)}\npage:   {page}")
-    errors.print(f"play:   {_again(config, policies[0])}", markup=False, highlight=False, soft_wrap=True)
+    again = played_by(config.scenario, config.defence, str(policies[0]), config.threat)
+    errors.print(f"play:   {again}", markup=False, highlight=False, soft_wrap=True)
     return 0
-
-
-def _again(config: TrainConfig, policy: Path) -> str:
-    """Return the command that plays a policy where it was trained."""
-    words = ["tailgate", "evaluate", "--scenario", config.scenario, "--defence", config.defence, "--attack", str(policy)]
-    for key, value in config.threat.items():
-        words += ["--dose", str(value)] if key == "budget" and value is not None else ["--threat", f"{key}={json.dumps(value)}"]
-    return shlex.join(words)
 
 
 def _harmless(config: TrainConfig, decisions: int) -> str:

@@ -35,6 +35,7 @@ def _try(options: argparse.Namespace) -> int:
     from tailgate.base.locks import alone
     from tailgate.base.reading import load_json
     from tailgate.board.attachments import Attachments
+    from tailgate.board.gates import explained
     from tailgate.board.trial import try_out
     from tailgate.cli.board import print_board
     from tailgate.core.scenario import load_suite
@@ -63,6 +64,8 @@ def _try(options: argparse.Namespace) -> int:
             say(f"{options.defence}: rank {place} of {of} in class {entry['class']}, provisional")
         else:
             say(f"{options.defence}: no rank; {entry['why']}")
+            for line in explained(entry["gates"]):
+                say(line)
     took = f"{(time.perf_counter() - begun) / 60:.1f} min"
     print(f"page: {page}; replay: {page.parent / replay if replay else 'none'} ({took})", file=sys.stderr)
     return 0

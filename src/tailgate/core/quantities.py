@@ -23,7 +23,8 @@ Settling = Annotated[int, Field(ge=0, le=100_000)]  # steps that are played when
 Size = Annotated[int, Field(ge=1, le=1000)]  # how many agents, states or sensors: matrices are as large
 
 Step = Annotated[float, Field(ge=1e-4, le=100.0, allow_inf_nan=False)]  # dt [s]
-Lag = Annotated[float, Field(ge=1e-3, le=1e4, allow_inf_nan=False)]  # time constant or time headway [s]
+Lag = Annotated[float, Field(ge=1e-3, le=1e4, allow_inf_nan=False)]  # time constant [s]
+Headway = Annotated[float, Field(ge=1e-3, le=60.0, allow_inf_nan=False)]  # time headway [s]
 Time = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]  # [s]
 Position = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]  # [m]
 Length = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]  # [m]

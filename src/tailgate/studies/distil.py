@@ -209,7 +209,8 @@ def distil(
     counts = (leaves,) if leaves is not None else LEAVES
     goal = float(game.damage(text, "select", SELECT).mean()) - loss
     actions, names = tuple(mode.name for mode in game.plan.action.modes), game.plan.observation.names
-    header = header_of(game.seat, {"summary": f"distilled from {text}", "config": {"scenario": game.scenario, "defence": game.defence}})
+    config = {"scenario": game.scenario, "defence": game.defence, "threat": game.threat}
+    header = header_of(game.seat, {"summary": f"distilled from {text}", "config": config})
     with tempfile.TemporaryDirectory() as folder:
         trees = _trees(game, counts, goal, header, Path(folder) / "tree.json", tell)
     chosen = next((one for one in trees if one.damage >= goal), max(trees, key=lambda one: one.damage))
@@ -217,8 +218,8 @@ def distil(
     own, theirs = (game.damage(attack, "report", episodes) for attack in (_attack(file), text))
     found = paired_difference(own.astype(float), theirs.astype(float), share=True)
     return {
-        "policy": text, "scenario": game.scenario, "defence": game.defence, "file": str(file), "leaves": len(leaves_of(chosen.tree)),
-        "reached": chosen.damage >= goal,
+        "policy": text, "scenario": game.scenario, "defence": game.defence, "threat": game.threat,
+        "file": str(file), "leaves": len(leaves_of(chosen.tree)), "reached": chosen.damage >= goal,
         "rules": words(chosen.tree, names, tuple(map(meaning, game.plan.action.modes))), "episodes": episodes,
         "trees": [{"leaves": one.leaves, "damage": one.damage} for one in trees],
         "damage": float(own.mean()), "policy_damage": float(theirs.mean()),
