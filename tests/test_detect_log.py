@@ -161,7 +161,11 @@ def test_a_recording_without_a_name_has_that_of_its_file(tmp_path, capsys):
     path.write_text("t,gap,speed,relative_speed\n" + "".join(f"{x:.1f},{30 + np.sin(x):.4f},20.0,{np.cos(x):.4f}\n" for x in t))
     columns = [word for name in ("t", "gap", "speed", "relative_speed") for word in ("--map", f"{name}={name}")]
     assert main(["detect-log", str(path), "--defence", "kf", *columns]) == 0
-    assert "drive.csv" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "drive.csv" in said.out and "no unit is named" in said.err
+    assert main(["detect-log", str(path), "--defence", "kf", *columns[:-2], "--map", "relative_speed=relative_speed:m/s", "--json"]) == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out)[0]["recording"] == "drive.csv" and "no unit" not in said.err
 
 
 def test_replays_are_written(tmp_path):

@@ -71,7 +71,7 @@ def test_an_episode_is_drawn_with_its_attack(rows):
 @pytest.mark.parametrize(
     ("draw", "words"),
     [
-        (lambda rows: tailgate.plot.matrices(rows), "2 scenarios and doses"), (lambda rows: tailgate.plot.matrices([]), "0 scenarios and doses"),
+        (lambda rows: tailgate.plot.matrices(rows), "2 scenarios and doses"), (lambda rows: tailgate.plot.matrices([]), "none that were played"),
         (lambda rows: tailgate.plot.dose_response([*rows, *(row | {"version": "9"} for row in rows)]), "twice"), (lambda rows: tailgate.plot.dose_response([]), "rows with doses"), (lambda rows: tailgate.plot.error_against_gap([]), "on a road"),
         (lambda rows: tailgate.plot.episode(trace_of("stop-and-go-v0", "kf", "fdi"), row=2), r"row: got 2; expected a whole number from 0 to 1"),
         (lambda rows: tailgate.plot.episode(trace_of("stop-and-go-v0", "kf", "fdi"), agent=-1), "agent: got -1"),

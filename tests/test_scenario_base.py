@@ -118,3 +118,8 @@ def test_two_scenarios_of_one_name_are_refused() -> None:
 def test_what_is_no_scenario_is_one_clear_error(value: object) -> None:
     with pytest.raises(InputError, match="scenario"):
         load_scenario(value)  # type: ignore[arg-type]
+
+
+def test_a_headway_in_milliseconds_is_refused() -> None:
+    with pytest.raises(InputError, match=r"controller acc.headway: got 1500.0; expected less than or equal to 60"):
+        load_scenario({"base": "stop-and-go-v0", "controller": {"headway": 1500.0}})

@@ -57,7 +57,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Payment:
-    """Base class of the payment of a step. Register a subclass with `@register("reward", NAME)`, in any module of `envs`."""
+    """Base class of the payment of a step. An instance is given as `reward=`, or by a name (`register`, entry points)."""
 
     road: ClassVar[bool] = False  # only collisions earn something
     peak: ClassVar[bool] = False  # asks for `Step.rise`

@@ -39,6 +39,8 @@ def matrices(rows: Sequence[Row], title: str = "") -> Figure:
     """
     table = [entry for entry in summarise(rows) if entry["crash"] is not None]
     places = {(entry["scenario"], entry["dose"]) for entry in table}
+    if not places:
+        raise InputError("rows", "none that were played", "rows of one scenario at one dose")
     if len(places) != 1:
         raise InputError("rows", f"{len(places)} scenarios and doses", "rows of one scenario at one dose")
     _single(table)

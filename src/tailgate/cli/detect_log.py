@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from functools import partial
+import dataclasses
 from pathlib import Path
 from typing import Any
 
 from tailgate.base.errors import InputError
-from tailgate.cli.shared import Commands, counted, own_classes, picture, say, show, table, threat_of, working
+from tailgate.cli.shared import Commands, counted, own_classes, picture, say, show, table, tell, threat_of, working
 
 
 def add(commands: Commands) -> None:
@@ -56,7 +56,10 @@ def _detect(options: argparse.Namespace) -> int:
         raise InputError("--length", options.length, "a number from 0 to 100 m")
     plot = picture("--plot", options.plot) if options.plot else None
     choice = Choice(options.vehicle, options.lead, options.length, mapping_of(options.map))
-    recordings = read(options.file, options.format, choice)
+    if options.map and not any(":" in text for text in options.map):
+        tell("no unit is named: columns count as s, m and m/s. A unit follows a colon, as in gap=dist:ft")
+    found = read(options.file, options.format, choice)
+    recordings = [dataclasses.replace(one, name=one.name or Path(options.file).name) for one in found]
     noise = Noise(options.range_sd, options.speed_sd)
     settings = Settings(noise, options.window, options.dose, tuple(threat_of(options).items()), options.hours)
     with working() as update:
@@ -65,7 +68,7 @@ def _detect(options: argparse.Namespace) -> int:
         write_parquet(Path(options.parquet), replays)
     if plot is not None and replays:
         write_atomic(plot, draw(replays[-1]), "plot")
-    show(options, rows, partial(_tables, Path(options.file).name))
+    show(options, rows, _tables)
     return 0
 
 
@@ -73,7 +76,7 @@ def _text(value: float | None, digits: int = 2) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def _tables(file: str, rows: list[dict[str, Any]]) -> None:
+def _tables(rows: list[dict[str, Any]]) -> None:
     good = [row for row in rows if row["status"] == "ok"]
     heads = ("recording", "defence", "attack", "hours", "false alarms an hour", "95 % interval", "alarm on", "gap error [m]",
              "speed error [m/s]", "detected", "delay [s]")  # fmt: skip
@@ -83,14 +86,14 @@ def _tables(file: str, rows: list[dict[str, Any]]) -> None:
         alarms = (_text(row["alarms_per_hour"]), interval) if row["attack"] == "none" else ("", "")  # under attack they are not false
         detected = f"{row['detected']} of {row['attacked']}" if "detected" in row else ""
         lines.append((
-            row["recording"] or file, row["defence"], row["attack"], _text(row["hours"], 3), *alarms,
+            row["recording"], row["defence"], row["attack"], _text(row["hours"], 3), *alarms,
             f"{100 * row['alarm_share']:.1f} %", _text(row["gap_error"], 3), _text(row["speed_error"], 3), detected,
             _text(row["delay"]) if "delay" in row else "",
         ))  # fmt: skip
     table(heads, lines, "replayed in the open loop; errors against a smoother", numbers=(3, 4, 6, 7, 8, 10))
     for row in good:
         for what, count in row["repairs"].items() if row["attack"] == "none" else ():
-            say(f"{row['recording'] or file}: {count} {what}")
+            say(f"{row['recording']}: {count} {what}")
     for row in rows:
         if row["status"] == "skipped":
-            say(f"{row['recording'] or file}: {row['defence']} against {row['attack']} is left out: {row['reason']}")
+            say(f"{row['recording']}: {row['defence']} against {row['attack']} is left out: {row['reason']}")
