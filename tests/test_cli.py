@@ -258,7 +258,7 @@ def test_a_run_is_compared_also_where_nobody_can_look_into_the_defence(run: Run)
 
 def test_python_runs_the_package_as_the_command(tmp_path: Path) -> None:
     """With two workers, which are spawned: they import the main module anew, and must not run it."""
-    command = [sys.executable, "-m", "tailgate", "evaluate", "--suite", "quick-v0", "--defence", "none", "--seeds", "1", "--workers", "2", "--json"]
+    command = [sys.executable, "-m", "tailgate", "evaluate", "--suite", "quick-v0", "--defence", "none", "--attack", "none", "--attack", "dos_jam:start_step=200", "--seeds", "1", "--workers", "2", "--json"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert {row["defence"] for row in json.loads(done.stdout)} == {"none"}

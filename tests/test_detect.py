@@ -125,6 +125,7 @@ def test_false_alarms_alone_are_added_where_a_board_lacks_them(detected: Data, t
     assert detect(path, QUICK, effort=EFFORT, workers=2) == detected == json.loads(path.read_text())
 
 
+@pytest.mark.long
 def test_a_threshold_is_checked_for_a_quarter_of_the_longest_run_at_most(detected: Data) -> None:
     place = load_scenario(QUICK.scenarios[0])
     seconds = {line["hours"]: line["running"] * 3600.0 for line in detected["detection"]["alarms"] if line["defence"] == "kf" and line["scenario"] == place.name}

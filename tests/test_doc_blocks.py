@@ -43,8 +43,8 @@ def test_the_blocks_of_a_page_run(page: str, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.thin(3)
-@pytest.mark.parametrize("page", [*NEEDED, "docs/gpu.md", "docs/leaderboard-page.md", "docs/replay.md"])
+@pytest.mark.thin(6)
+@pytest.mark.parametrize("page", ["docs/gpu.md", "docs/leaderboard-page.md", "docs/replay.md", *NEEDED])
 def test_the_blocks_of_a_page_run_on_what_its_reader_has(page: str, tmp_path: Path) -> None:
     for needed in ("pyarrow", "pygame", "highway_env", "optuna", "torch"):
         pytest.importorskip(needed)

@@ -129,7 +129,7 @@ def inside(tube, trace, size, gaps):
     return kept.mean(), max(used.max() for used in off.values())
 
 
-@pytest.mark.thin(2)
+@pytest.mark.long
 @pytest.mark.parametrize("size", [0.0, 0.3])
 def test_ten_thousand_runs_in_a_lane_stay_inside_of_the_tube(size):
     """Under random injections of both signs; with six standard deviations all, with a Gaussian range of 1 % at most that many leave."""
