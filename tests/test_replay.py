@@ -181,6 +181,15 @@ def test_a_policy_is_found_again_by_its_content(tmp_path, monkeypatch):
     assert str(tmp_path) not in render(replay) and "moved/policy-0" in render(replay)  # no page tells of somebody's folders
 
 
+def test_a_file_that_changed_and_does_not_play_is_named(tmp_path):
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("about: x\nphases:\n  - {kind: fdi, value: 1.0}\n")
+    (row,) = evaluate(scenarios=["stop-and-go-v0"], defences=["kf"], attacks=[str(mine)], seeds=1)
+    mine.write_text("about: x\nphases:\n  - {kind: replay, value: 20}\n")
+    with pytest.raises(InputError, match=r"grants replay; the file of the attack is another one than the row's$"):
+        play(row, Filter(attack=row["attack"]))
+
+
 def test_the_data_of_the_page_are_those_of_the_trace(pick):
     """Every step of every decision, exactly; curves to six digits, with the entry that belongs to the step."""
     replay = play(pick("kf", "fdi_gaussian:start_step=5,targets=[position],sd=4", 1))

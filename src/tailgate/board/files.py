@@ -24,9 +24,12 @@ BOARD = "board.json"
 
 
 def load(path: Path) -> Any:
-    """Return the JSON data of a board's file, to be read by `read_board`."""
+    """Return the JSON data of a board's file, to be read by `read_board`. Raises InputError for a file of another format."""
     rows = "; rows are played again by `tailgate leaderboard verify`" if ".jsonl" in path.suffixes else ""
-    return read_json(path, "board", "board.json", rows)
+    data = read_json(path, "board", "board.json", rows)
+    if isinstance(data, dict) and data.get("format") != FORMAT:
+        raise InputError("board", str(path), f"a file of the format {FORMAT}; its format is {data.get('format')!r}")
+    return data
 
 
 def read_json(path: Path, where: str, what: str = "JSON file", hint: str = "") -> Any:

@@ -197,9 +197,16 @@ def play(row: Row, allowed: Filter | None = None) -> Replay:
         raise InputError("row", f"{row['scenario']}, {row['defence']}, {row['attack']}", f"a row that matches {allowed}")
     defence_spec, attack_spec = _component("defence", row, allowed.defence), _component("attack", row, allowed.attack)
     place = _place(row, allowed.scenario)
-    loop, attack = place.loop(defence_spec.make(), defence_spec.entry.uses), attack_spec.make()
-    states = episode(loop, attack, draws.keys(row["purpose"], [row["seed"]]))
-    start, _ = next(states)
+    try:
+        loop, attack = place.loop(defence_spec.make(), defence_spec.entry.uses), attack_spec.make()
+        states = episode(loop, attack, draws.keys(row["purpose"], [row["seed"]]))
+        start, _ = next(states)
+    except InputError as error:
+        held = (("defence", defence_spec.digest, row["defence_digest"]), ("attack", attack_spec.digest, row["attack_digest"]))
+        changed = " and ".join(name for name, here, then in held if here != then)
+        if not changed:
+            raise
+        raise InputError(error.field, error.value, f"{error.expected}; the file of the {changed} is another one than the row's") from None
     recorder, gate = Recorder(loop, start), [_gate(loop, start)]
     for state, frame in states:
         assert frame is not None
