@@ -11,7 +11,7 @@ from tailgate.core.registry import Spec
 from tailgate.core.threat import ThreatModel
 from tailgate.play.trace import rollout
 from tailgate.roads.detect_log import Settings, at_hours, detect, draw, figures, smoothed, synthetic, threat_of, write_parquet
-from tailgate.roads.readers import read
+from tailgate.roads.readers import read, without_unit
 from tailgate.roads.recording import Raw, checked
 from tailgate.roads.replayed import Noise, cut, loop_over, rows
 
@@ -162,10 +162,12 @@ def test_a_recording_without_a_name_has_that_of_its_file(tmp_path, capsys):
     columns = [word for name in ("t", "gap", "speed", "relative_speed") for word in ("--map", f"{name}={name}")]
     assert main(["detect-log", str(path), "--defence", "kf", *columns]) == 0
     said = capsys.readouterr()
-    assert "drive.csv" in said.out and "no unit is named" in said.err
-    assert main(["detect-log", str(path), "--defence", "kf", *columns[:-2], "--map", "relative_speed=relative_speed:m/s", "--json"]) == 0
+    assert "drive.csv" in said.out and "no unit is named in gap=gap, speed=speed, relative_speed=relative_speed:" in said.err
+    units = [f"{text}:{'m' if text == 'gap=gap' else 'm/s'}" if "=" in text and text != "t=t" else text for text in columns]
+    assert main(["detect-log", str(path), "--defence", "kf", *units, "--json"]) == 0
     said = capsys.readouterr()
     assert json.loads(said.out)[0]["recording"] == "drive.csv" and "no unit" not in said.err
+    assert without_unit(["gap=gap:m", "speed=v:raw"]) == ["speed=v:raw"]
 
 
 def test_replays_are_written(tmp_path):

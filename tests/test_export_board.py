@@ -3,7 +3,9 @@
 import csv
 import io
 import json
+import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,29 +17,56 @@ from tailgate.cli import main
 FILE = Path(__file__).parents[1] / "results" / "quick-v1" / "board.json.xz"
 
 
-def _csv(name: str, most: int | None = None) -> list[dict[str, str]]:
-    return list(csv.DictReader(io.StringIO(exported(load(FILE.parents[1] / name / "board.json.xz"), "csv", most).decode())))
+def _csv(board: dict[str, Any], most: int | None = None) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(exported(board, "csv", most).decode())))
 
 
-def test_csv_has_the_figures_of_the_head_as_numbers() -> None:
-    """For each dose and each knowledge; in the order of the page."""
-    rows = [row for row in _csv("radar-v1") if row["knowledge"] == "black" and row["status"] == "ranked"]
-    head = lines(load(FILE.parents[1] / "radar-v1/board.json.xz"))
-    assert len(rows) == 3 * 14 and set(rows[0]) == set(COLUMNS)
-    for k, line in enumerate(head[1:15]):
-        own, shown = rows[3 * k : 3 * k + 3], dict(zip(head[0], line, strict=True))
-        assert {row["defence"] for row in own} == {shown["defence"]} and {row["class"] for row in own} == {shown["class"]}
-        for row in own:
-            assert shown[f"undamaged at {row['dose']}"].startswith(f"{100 * float(row['undamaged']):.0f} % (at least ")
-            assert 0.0 <= float(row["undamaged_low"]) <= float(row["undamaged"]) and row["worst_attack"]
-        middle = own[1]
-        none, impact = shown["no attack damages at 4"], shown["impact at 4 [m/s]"]
-        assert none.startswith(f"{100 * float(middle['no_attack_damages']):.0f} %") and shown["gap"] == f"{100 * float(middle['mean_gap']):+.1f} %"
-        assert impact == (f"{float(middle['impact_mean']):.3g} (90 %: {float(middle['impact_q90']):.3g})" if middle["impact_mean"] else "-")
+@pytest.mark.parametrize("name", ["radar-v1", "quick-v1"])
+def test_every_figure_of_the_csv_is_that_of_the_board(name: str) -> None:
+    """A line for each defence, dose and knowledge, in the order of the page."""
+    board = load(FILE.parents[1] / name / "board.json.xz")
+    rows, held = _csv(board), {entry["defence"]: entry for entry in board["entries"]}
+    assert list(dict.fromkeys(row["defence"] for row in rows)) == [line[0] for line in lines(board)[1:]]
+    assert len(rows) == sum(len(entry["rates"]) for entry in board["entries"]) and tuple(rows[0]) == COLUMNS
+    smallest = min(board["suite"]["doses"])
+    for row in rows:
+        entry = held[row["defence"]]
+
+        def at(part: str, row: dict[str, str] = row, entry: dict[str, Any] = entry) -> dict[str, Any]:
+            return next((one for one in entry[part] if (str(one["dose"]), one["knowledge"]) == (row["dose"], row["knowledge"])), {})
+
+        rate, harm, rank = at("rates"), at("under_attack"), entry["rank"] or {"best": None, "worst": None}
+        none, hard = at("pointwise")["undamaged"] or {"value": None, "low": None, "high": None}, harm.get("severity", {})
+        dose = entry["critical_dose"][row["knowledge"]]
+        wanted = {
+            "class": entry["class"], "status": entry["status"], "why": entry["why"], "rank_best": rank["best"], "rank_worst": rank["worst"],
+            "undamaged": rate["undamaged"]["value"], "undamaged_low": rate["undamaged"]["low"], "attacks": rate["attacks"],
+            "worst_scenario": rate["worst"]["scenario"], "worst_attack": rate["worst"]["attack"], "no_attack_damages": none["value"],
+            "no_attack_damages_low": none["low"], "no_attack_damages_high": none["high"], "impact_mean": hard.get("mean"),
+            "impact_q90": hard.get("q90"), "distance_kept": harm.get("availability"), "distance_kept_least": (harm.get("least") or {}).get("value"),
+            "mean_gap_change": entry["mean_gap"]["value"] if entry["mean_gap"] else None,
+        } | {
+            f"critical_dose{end}": "above" if dose[key] is None else "below" if 0 < dose[key] <= smallest else dose[key]
+            for end, key in (("", "value"), ("_low", "low"), ("_high", "high"))
+        }  # fmt: skip
+        assert {name: row[name] for name in wanted} == {name: "" if value is None else str(value) for name, value in wanted.items()}
+        assert not entry["rank"] or int(row["ranked_in_class"]) == sum(e["rank"] is not None and e["class"] == entry["class"] for e in held.values())
+    assert {"below", "above"} <= {row["critical_dose"] for row in rows} and len({row["critical_dose_high"] for row in rows}) > 2 - (name == "quick-v1")
 
 
-def test_csv_of_few_defences() -> None:
-    assert len({row["defence"] for row in _csv("quick-v1", 3)}) == 3
+def test_csv_of_few_defences_and_of_one_without_figures() -> None:
+    board = load(FILE)
+    assert len({row["defence"] for row in _csv(board, 3)}) == 3
+    bare = board | {"entries": [entry | {"rates": []} if entry["defence"] == "none" else entry for entry in board["entries"]]}
+    (row,) = [row for row in _csv(bare) if row["defence"] == "none"]
+    assert row["status"] == "unranked" and row["why"] and not row["dose"]
+    unlimited = json.loads(json.dumps(board).replace('"dose": 12', '"dose": null')) | {"suite": board["suite"] | {"doses": [None], "shown": {}}}
+    assert {row["dose"] for row in _csv(unlimited)} == {"none"}
+
+
+def test_every_column_of_the_csv_is_explained() -> None:
+    page = (FILE.parents[2] / "docs/leaderboard-page.md").read_text(encoding="utf-8").partition("## Figures as CSV")[2]
+    assert re.findall(r"`(\w+)`", "".join(re.findall(r"^\| (`.*?) \|", page, flags=re.M))) == list(COLUMNS)
 
 
 def test_latex_is_a_table_without_a_bare_special_character() -> None:

@@ -301,7 +301,7 @@ def test_a_policy_that_does_not_fit_names_the_options_of_its_training(tmp_path: 
     path = _policy(tmp_path, {"action": "mode"})
     plain, fewer = json.loads(path.read_text()), _place("black").with_threat(kinds=("fdi",)).brief()
     told = r"; it was trained with --scenario braking-v0 --threat 'kinds=\[\"dos_jam\", \"fdi\"\]' --threat fdi_bound=3.0 --threat end=null --threat knowledge=black$"
-    bare = r"threat model( \(none, fdi\+, fdi-\))?$"
+    bare = r"(expected 3, .* under this threat model \(none, fdi\+, fdi-\)|the observation of this scenario and threat model)$"
     for config, words in (
         ({"scenario": "braking-v0", "threat": threat}, told), (5, bare), ({"scenario": 5, "threat": "\x1b["}, bare), ({"scenario": "\x1b[2J"}, bare),
     ):  # fmt: skip

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tailgate.board.gates import explained
+from tailgate.board.gates import explained, failure
 from tailgate.board.trial import published
 from tailgate.cli import main
 from tailgate.core.scenario import list_suites, load_suite
@@ -105,5 +105,7 @@ def test_a_class_without_a_rank_is_told_each_gate_that_it_fails() -> None:
         {"gate": "jerk", "scenario": "a", "value": 1.0, "limit": 1.2, "passed": True},
     ]
     gap, alarms = explained(found)
-    assert gap == "gate gap, a: 0.4, limit 0.1: by how much the mean gap is longer than that of the undefended car, as a share of it"
-    assert alarms.startswith("gate false alarms, b: 0.98, limit 0.5: share of the time") and "tailgate calibrate" in alarms
+    assert gap == "gate gap: 0.4 on a, limit 0.1 (by how much the mean gap is longer than that of the undefended car, as a share of it)"
+    assert alarms.startswith("gate false alarms: 0.98 on b, limit 0.5 (share of the time") and "tailgate calibrate" in alarms
+    assert explained([{"gate": "clean run", "scenario": "a", "value": None, "limit": None, "passed": False}]) == ["gate clean run: no clean run to judge by on a"]
+    assert failure(found) == "gate gap: 0.4 on a, limit 0.1, and 1 more"

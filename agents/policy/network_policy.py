@@ -183,10 +183,9 @@ class PolicyAttack:
             raise InputError(f"policy {self.path.name}", f"observation {shown}", wanted)
         outputs = network.outputs
         if outputs != action.size:
-            names = f" ({', '.join(mode.name for mode in action.modes)})" if action.discrete else ""
+            names, what = (f" ({', '.join(mode.name for mode in action.modes)})", "actions") if action.discrete else ("", "outputs")
             wanted = f"{action.size}, as environment.action={header.action.action} has under this threat model{names}"
-            hint = _trained_with(header) or "; --threat kinds=[...] grants fewer kinds of attack" * (outputs < action.size)
-            raise InputError(f"policy {self.path.name}", f"{outputs} actions", wanted + hint)
+            raise InputError(f"policy {self.path.name}", f"{outputs} {what}", wanted + _trained_with(header))
         if (header.masked and not action.discrete) or (header.squashed and action.discrete):
             made = "masked" if header.masked else "squashed"
             raise InputError(f"policy {self.path.name}.{made}", True, f"another kind of action than {header.action.action}")

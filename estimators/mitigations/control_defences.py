@@ -16,6 +16,7 @@ import numpy as np
 from tailgate import num
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Finite, Model, NonNegative, Positive, Received, param
+from tailgate.core.quantities import Headway
 from tailgate.core.registry import register
 from tailgate.estimators.compose import Gate, GateOut, M, ModeName, ReactionPlan, X, quiet
 from tailgate.estimators.parts import Decision, Verdict
@@ -75,7 +76,7 @@ class LocalState(NamedTuple):
 class OwnSensors(Choice[LocalState, LocalPlan]):
     """Base of the control defences that compute a command from a car's own sensors: a subclass's `bounds` makes limits of it."""
 
-    headway: Positive = param(3.0, "time headway tau_h of the own law, best the controller's [s]")
+    headway: Headway = param(3.0, "time headway tau_h of the own law, best the controller's [s]")
     standstill: NonNegative = param(5.0, "minimum stopping distance d_r of the own law, best the controller's [m]")
     lag: Positive = param(1.008, "actuator lag tau that is reckoned with [s]")
     smoothing: Positive = param(0.5, "time constant T of the gap's rate [s]")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from tailgate.base.pytree import Array
 from .files import read_board
 from .head import filled_columns, lines, title
 from .order import ordered
-from .schema import Curve, Data, Entry, Point
+from .schema import Curve, Data, Entry, Point, Rate
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -30,9 +31,9 @@ SPECIAL = {
 SIGNS = {"<=": r"$\leq$", ">=": r"$\geq$"}
 TITLE = "Tailgate: a benchmark in which an adversary learns when to attack the sensors of adaptive cruise control"  # as in CITATION.cff
 COLUMNS = (
-    "defence", "class", "status", "rank_best", "rank_worst", "knowledge", "dose", "undamaged", "undamaged_low", "attacks", "worst_scenario",
-    "worst_attack", "no_attack_damages", "no_attack_damages_low", "no_attack_damages_high", "impact_mean", "impact_q90", "distance_kept",
-    "distance_kept_least", "critical_dose", "critical_dose_low", "critical_dose_high", "mean_gap",
+    "defence", "class", "status", "why", "rank_best", "rank_worst", "ranked_in_class", "knowledge", "dose", "undamaged", "undamaged_low",
+    "attacks", "worst_scenario", "worst_attack", "no_attack_damages", "no_attack_damages_low", "no_attack_damages_high", "impact_mean",
+    "impact_q90", "distance_kept", "distance_kept_least", "critical_dose", "critical_dose_low", "critical_dose_high", "mean_gap_change",
 )  # fmt: skip
 DRAWN = 8  # defences with a colour in the figure; the others are grey
 
@@ -64,32 +65,51 @@ def exported(board: Data, form: str, most: int | None = None) -> bytes:
     if form in ("svg", "pdf"):
         return _figure(board, form, most)
     if form == "csv":
-        return _csv(ordered(read_board(board).entries)[:most])
+        return _csv(board, most)
     head, *body = lines(board)
     return _latex(board, [head, *body[:most]]).encode()
 
 
-def _csv(entries: Sequence[Entry]) -> bytes:
-    """Return a line for each defence, dose and knowledge; an empty cell where there is no figure, or a dose beyond the largest."""
+def _csv(board: Data, most: int | None) -> bytes:
+    """Return `COLUMNS`: a line for each defence, dose and knowledge, and one for a defence without figures."""
+    held = read_board(board)
+    entries = ordered(held.entries)
+    ranked = Counter(entry.class_ for entry in entries if entry.rank)
     out = io.StringIO()
-    table = csv.writer(out, lineterminator="\n")
-    table.writerow(COLUMNS)
-    for entry in entries:
-        pointwise = {(line.dose, line.knowledge): line.undamaged for line in entry.pointwise}
-        attacked = {(line.dose, line.knowledge): line for line in entry.under_attack}
-        for rate in entry.rates:
-            at = (rate.dose, rate.knowledge)
-            held, none, harm, dose = rate.undamaged, pointwise.get(at), attacked.get(at), entry.critical_dose.get(rate.knowledge)
-            table.writerow([
-                entry.defence, entry.class_, entry.status, *([entry.rank.best, entry.rank.worst] if entry.rank else ["", ""]),
-                rate.knowledge, rate.dose, *([held.value, held.low] if held else ["", ""]), rate.attacks,
-                *([rate.worst.scenario, rate.worst.attack] if rate.worst else ["", ""]),
-                *([none.value, none.low, none.high] if none else [""] * 3),
-                *([harm.severity.mean, harm.severity.q90, harm.availability] if harm else [""] * 3),
-                harm.least.value if harm and harm.least else "", *([dose.value, dose.low, dose.high] if dose else [""] * 3),
-                entry.mean_gap.value if entry.mean_gap else "",
-            ])  # fmt: skip
+    table = csv.DictWriter(out, COLUMNS, lineterminator="\n")
+    table.writeheader()
+    for entry in entries[:most]:
+        shared: dict[str, object] = {"defence": entry.defence, "class": entry.class_, "status": entry.status, "why": entry.why}
+        if entry.rank:
+            shared |= {"rank_best": entry.rank.best, "rank_worst": entry.rank.worst, "ranked_in_class": ranked[entry.class_]}
+        if entry.mean_gap:
+            shared["mean_gap_change"] = entry.mean_gap.value
+        for line in [_figures(entry, rate, held.suite.doses) for rate in entry.rates] or [{}]:
+            table.writerow(shared | line)
     return out.getvalue().encode()
+
+
+def _figures(entry: Entry, rate: Rate, doses: Sequence[int | None]) -> dict[str, object]:
+    """Return the figures of a defence at one dose for one knowledge."""
+    at = (rate.dose, rate.knowledge)
+    out: dict[str, object] = {"knowledge": rate.knowledge, "dose": "none" if rate.dose is None else rate.dose, "attacks": rate.attacks}
+    if rate.undamaged:
+        out |= {"undamaged": rate.undamaged.value, "undamaged_low": rate.undamaged.low}
+    if rate.worst:
+        out |= {"worst_scenario": rate.worst.scenario, "worst_attack": rate.worst.attack}
+    none = next((line.undamaged for line in entry.pointwise if (line.dose, line.knowledge) == at), None)
+    if none:
+        out |= {"no_attack_damages": none.value, "no_attack_damages_low": none.low, "no_attack_damages_high": none.high}
+    harm = next((line for line in entry.under_attack if (line.dose, line.knowledge) == at), None)
+    if harm:
+        out |= {"impact_mean": harm.severity.mean, "impact_q90": harm.severity.q90, "distance_kept": harm.availability}
+        out["distance_kept_least"] = harm.least.value if harm.least else None
+    critical = entry.critical_dose.get(rate.knowledge)
+    if critical:
+        least = min((dose for dose in doses if dose), default=0)
+        ends = {"critical_dose": critical.value, "critical_dose_low": critical.low, "critical_dose_high": critical.high}
+        out |= {name: "above" if end is None else "below" if 0 < end <= least else end for name, end in ends.items()}
+    return out
 
 
 def escaped(text: str) -> str:

@@ -26,9 +26,15 @@ BOARD = "board.json"
 def load(path: Path) -> Any:
     """Return the JSON data of a board's file, to be read by `read_board`. Raises InputError for a file of another format."""
     rows = "; rows are played again by `tailgate leaderboard verify`" if ".jsonl" in path.suffixes else ""
-    data = read_json(path, "board", "board.json", rows)
-    if isinstance(data, dict) and data.get("format") != FORMAT:
-        raise InputError("board", str(path), f"a file of the format {FORMAT}; its format is {data.get('format')!r}")
+    return _formatted(read_json(path, "board", "board.json", rows), f"board {path}")
+
+
+def _formatted(data: object, where: str) -> dict[str, Any]:
+    """Return data of the format of boards. Raises InputError for others."""
+    if not isinstance(data, dict):
+        raise InputError(where, data, f"a mapping in the format {FORMAT}")
+    if data.get("format") != FORMAT:
+        raise InputError(f"{where}.format", data.get("format"), FORMAT)
     return data
 
 
@@ -64,12 +70,8 @@ def amended(board: Data, fields: Mapping[str, Data], **parts: object) -> Data:
 
 def read_board(data: object, where: str = "board") -> Board:
     """Return a board from JSON data; raises InputError that names the first field that is not of the format."""
-    if not isinstance(data, dict):
-        raise InputError(where, data, f"a mapping in the format {FORMAT}")
-    if data.get("format") != FORMAT:
-        raise InputError(f"{where}.format", data.get("format"), FORMAT)
     try:
-        board = Board.model_validate(data)
+        board = Board.model_validate(_formatted(data, where))
     except ValidationError as error:
         first = error.errors()[0]
         place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"])

@@ -30,7 +30,7 @@ MEANS = {  # a gate, what its figure is, without an attack
     "gap": "by how much the mean gap is longer than that of the undefended car, as a share of it",
     "jerk": "RMS jerk over that of the undefended car",
     "progress": "distance over that of the undefended car",
-    "every episode": f"share of the episodes with {FAR:.0%} of the distance of the undefended car",
+    "every episode": f"share of the episodes with at least {100 * FAR:.0f} % of the distance of the undefended car",
     "collisions": "damaged episodes",
     "bound": "damaged episodes",
     "false alarms": "share of the time with an alarm (`tailgate calibrate` sets thresholds)",
@@ -94,8 +94,14 @@ def _gate(name: str, scenario: str, value: float | None, limit: float | None, pa
 
 def explained(found: list[Gate]) -> list[str]:
     """Return a line for each gate that is not passed, with its figure and what the figure is."""
-    missed = [gate for gate in found if not gate["passed"] and gate["value"] is not None]
-    return [f"gate {g['gate']}, {g['scenario']}: {g['value']:.3g}, limit {g['limit']:g}: {MEANS[g['gate']]}" for g in missed]
+    missed = [gate for gate in found if not gate["passed"]]
+    return [_told(gate) + ("" if gate["value"] is None else f" ({MEANS[gate['gate']]})") for gate in missed]
+
+
+def _told(gate: Gate) -> str:
+    if gate["value"] is None:
+        return f"gate {gate['gate']}: no clean run to judge by on {gate['scenario']}"
+    return f"gate {gate['gate']}: {gate['value']:.3g} on {gate['scenario']}, limit {gate['limit']:g}"
 
 
 def failure(found: list[Gate]) -> str:
@@ -103,8 +109,5 @@ def failure(found: list[Gate]) -> str:
     gate = next((gate for gate in found if not gate["passed"]), None)
     if gate is None:
         return ""
-    if gate["value"] is None:
-        return f"gate {gate['gate']}: no clean run to judge by on {gate['scenario']}"
     others = sum(not gate["passed"] for gate in found) - 1
-    more = f", and {others} more" if others else ""
-    return f"gate {gate['gate']}: {gate['value']:.3g} on {gate['scenario']}, limit {gate['limit']:g}{more}"
+    return _told(gate) + (f", and {others} more" if others and gate["value"] is not None else "")

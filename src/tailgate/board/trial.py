@@ -13,7 +13,7 @@ from tailgate.base.progress import cells, lasting
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite
 from tailgate.core.schema import digest
-from tailgate.evaluation.rows import read_rows
+from tailgate.evaluation.rows import CLEAN, read_rows
 
 from .attacked import Progress, attack
 from .files import agree, board_in, load, read_board, save
@@ -96,8 +96,8 @@ def try_out(
 
 def _played(folder: Path, defence: str) -> None:
     """Raise InputError for a class that failed in every clean episode: it has no figure, and its page would have none."""
-    rows = [row for path in files_of_rows(folder) for row in read_rows(path) if row["defence"] == defence and row["attack"] == "none"]
-    if rows and all(row["status"] == "error" for row in rows):
+    rows = [row for path in files_of_rows(folder) for row in read_rows(path) if row["defence"] == defence and row["attack"] == CLEAN]
+    if rows and all(row["status"] != "ok" for row in rows):
         raise InputError("defence", defence, f"a class that plays an episode to its end ({rows[0]['reason']})")
 
 

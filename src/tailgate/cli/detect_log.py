@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +45,7 @@ def add(commands: Commands) -> None:
 def _detect(options: argparse.Namespace) -> int:
     from tailgate.base.files import write_atomic
     from tailgate.roads.detect_log import Settings, detect, draw, write_parquet
-    from tailgate.roads.readers import Choice, mapping_of, read
+    from tailgate.roads.readers import Choice, mapping_of, read, without_unit
     from tailgate.roads.replayed import Noise
 
     own_classes()
@@ -56,10 +55,9 @@ def _detect(options: argparse.Namespace) -> int:
         raise InputError("--length", options.length, "a number from 0 to 100 m")
     plot = picture("--plot", options.plot) if options.plot else None
     choice = Choice(options.vehicle, options.lead, options.length, mapping_of(options.map))
-    if options.map and not any(":" in text for text in options.map):
-        tell("no unit is named: columns count as s, m and m/s. A unit follows a colon, as in gap=dist:ft")
-    found = read(options.file, options.format, choice)
-    recordings = [dataclasses.replace(one, name=one.name or Path(options.file).name) for one in found]
+    recordings = read(options.file, options.format, choice)
+    if bare := without_unit(options.map):
+        tell(f"no unit is named in {', '.join(bare)}: m or m/s is taken. A unit follows a colon, as in gap=dist:ft")
     noise = Noise(options.range_sd, options.speed_sd)
     settings = Settings(noise, options.window, options.dose, tuple(threat_of(options).items()), options.hours)
     with working() as update:

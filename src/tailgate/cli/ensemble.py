@@ -66,9 +66,10 @@ def _again(report: dict[str, Any], suite: str, kept: bool) -> str:
     found = [(one["damage"], cell, one["attack"]) for cell in report["cells"] for one in cell["members"] if one["attack"]]
     if not found:
         return ""
-    damage, cell, attack = max(found, key=lambda one: one[0])
+    damage, cell, attack = max(found, key=lambda one: (one[0], kept or "path=" not in one[2]))
     if not kept and "path=" in attack:
-        return f"the most harmful one ({damage:.1%} in {cell['scenario']}) is a file, and no file was kept: --out DIR keeps them"
+        where = f"{cell['scenario']}, dose {'own' if cell['dose'] is None else cell['dose']}"
+        return f"the most harmful one ({damage:.1%} in {where}) is a file, and no file was kept: --out DIR keeps them"
     words = ["tailgate", "evaluate", "--suite", suite, "--scenario", cell["scenario"]]
     words += ["--dose", "none" if cell["dose"] is None else str(cell["dose"]), "--defence", report["defence"], "--attack", attack]
     return f"to play the most harmful one again: {shlex.join([*words, '--out', 'rows.jsonl'])}"

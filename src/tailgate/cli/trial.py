@@ -63,9 +63,8 @@ def _try(options: argparse.Namespace) -> int:
             place = " to ".join(map(str, dict.fromkeys([rank["best"], rank["worst"]])))
             say(f"{options.defence}: rank {place} of {of} in class {entry['class']}, provisional")
         else:
-            say(f"{options.defence}: no rank; {entry['why']}")
-            for line in explained(entry["gates"]):
-                say(line)
+            for line in explained(entry["gates"]) or [entry["why"]]:
+                say(f"{options.defence}: no rank; {line}")
     took = f"{(time.perf_counter() - begun) / 60:.1f} min"
     print(f"page: {page}; replay: {page.parent / replay if replay else 'none'} ({took})", file=sys.stderr)
     return 0

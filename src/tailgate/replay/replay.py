@@ -202,8 +202,8 @@ def play(row: Row, allowed: Filter | None = None) -> Replay:
         states = episode(loop, attack, draws.keys(row["purpose"], [row["seed"]]))
         start, _ = next(states)
     except InputError as error:
-        held = (("defence", defence_spec.digest, row["defence_digest"]), ("attack", attack_spec.digest, row["attack_digest"]))
-        changed = " and ".join(name for name, here, then in held if here != then)
+        specs = {"defence": defence_spec, "attack": attack_spec}
+        changed = " and ".join(name for name, spec in specs.items() if spec.digest != row[f"{name}_digest"])
         if not changed:
             raise
         raise InputError(error.field, error.value, f"{error.expected}; the file of the {changed} is another one than the row's") from None

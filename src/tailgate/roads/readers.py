@@ -11,6 +11,7 @@ csv       any CSV, with a mapping of columns and units
 from __future__ import annotations
 
 import csv
+import dataclasses
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -44,6 +45,11 @@ class Choice:
     lead: str | None = None
     length: float = LENGTH
     mapping: tuple[tuple[str, str, str], ...] = ()  # what, column, unit
+
+
+def without_unit(texts: Sequence[str]) -> list[str]:
+    """Return the texts, such as `speed=v_ego`, that name no unit of a length or speed. Another unit of time is refused anyway."""
+    return [text for text in texts if text.rpartition(":")[2] not in UNITS and not text.startswith("t=")]
 
 
 def mapping_of(texts: Sequence[str]) -> tuple[tuple[str, str, str], ...]:
@@ -80,7 +86,8 @@ def read(source: str, format: str | None = None, choice: Choice = Choice()) -> l
         if isinstance(error, InputError):
             raise
         raise InputError(f"{kind} file", source, f"a readable one ({said(error)})") from None
-    return [checked(raw, f"{kind} file {path.name}") for raw in raws]
+    found = [checked(raw, f"{kind} file {path.name}") for raw in raws]
+    return [dataclasses.replace(one, name=one.name or path.name) for one in found]
 
 
 def _kind(source: str, path: Path, choice: Choice) -> str:
