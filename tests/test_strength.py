@@ -264,7 +264,7 @@ def test_what_cannot_be_played_is_skipped_with_the_reason(tmp_path: Path) -> Non
     """A policy of another layout, and a defence that an attack has no use of; what is misspelt is an error."""
     other = str(_always(tmp_path, "p", kinds=["fdi"]))
     report = dose_response([other, "none"], ["kf"], PLACE, [5], episodes=2, threat=THREAT)
-    assert [("skipped" in c) for c in report["curves"]] == [False, True] and "outputs" in report["curves"][1]["skipped"]
+    assert [("skipped" in c) for c in report["curves"]] == [False, True] and "3 actions" in report["curves"][1]["skipped"]
     for bad in ([0], [], [2.5]):
         with pytest.raises(InputError, match="doses"):
             dose_response(["none"], ["kf"], PLACE, bad, episodes=2)  # type: ignore[arg-type]

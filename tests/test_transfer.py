@@ -113,5 +113,5 @@ def test_policies_of_different_cells_need_one_named(tmp_path: Path, brief_place:
     with pytest.raises(InputError, match="--threat"):
         transfer(texts, episodes=2)
     report = transfer(texts, scenario=brief_place, threat=THREAT, episodes=2)
-    assert [item["policy"].split("/")[-1] for item in report["skipped"]] == ["b"] and "outputs" in report["skipped"][0]["reason"]
+    assert [item["policy"].split("/")[-1] for item in report["skipped"]] == ["b"] and "3 actions" in report["skipped"][0]["reason"]
     assert [e["seeds"] for e in report["entries"]] == [1]
