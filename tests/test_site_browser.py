@@ -164,7 +164,7 @@ SEEN = """return [...document.querySelectorAll(arguments[0])].map(t => [t.innerT
 
 @pytest.mark.page
 def test_what_tells_most_stands_in_a_phone_without_scrolling(tab, site, show):
-    """Rank and undamaged shares beside the name, which has the class below it; of an entry the gates passed, the worst damage and who is weaker."""
+    """A board shows name, rank and undamaged shares, the class below the name. An entry shows gates, the worst damage and who is weaker."""
     show(420, "light")
     tab.get(site.as_uri())
     heads = dict(tab.execute_script(SEEN, "#suite-1 .ranks thead th"))
