@@ -16,7 +16,7 @@ from tailgate.cli import main
 from tailgate.core.scenario import load_suite
 from tailgate.engine import cards, on_device
 from tailgate.engine.cards import DeviceError, playing_on
-from tailgate.engine.program import traced
+from tailgate.engine.tracing import traced
 from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.envs.gym.batches import side_by_side
 from tailgate.envs.gym.gymnasium_env import AdversaryEnv, AdversaryVectorEnv

@@ -19,8 +19,8 @@ from tailgate.engine.matrices import dense
 from tailgate.engine.on_device import CudaProgram
 from tailgate.engine.operations import BINARY, BOOL, COMPARISONS, DTYPES, UNARY
 from tailgate.engine.parameters import lifted
-from tailgate.engine.program import Trace as Nodes
-from tailgate.engine.program import traced
+from tailgate.engine.tracing import Trace as Nodes
+from tailgate.engine.tracing import traced
 from tailgate.play.commanded import commanded
 from tailgate.play.rollouts import Rollout, rollout_of
 from tailgate.play.trace import Trace, rollout

@@ -8,7 +8,8 @@ import pytest
 from tailgate.engine.evaluation import evaluate
 from tailgate.engine.graph import Graph, Node
 from tailgate.engine.operations import BOOL, COMPARISONS, DTYPES, FLOAT
-from tailgate.engine.program import Program, Trace
+from tailgate.engine.program import Program
+from tailgate.engine.tracing import Trace
 
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, 1e-310, -5e-324, 1e308, -1e308, np.inf, -np.inf, np.nan, 2.0**63, -(2.0**63), 3.7, 255.5])
 

@@ -14,7 +14,8 @@ from tailgate.engine.array import Traced
 from tailgate.engine.graph import Graph
 from tailgate.engine.operations import FLOAT
 from tailgate.engine.parameters import lifted
-from tailgate.engine.program import Call, Program, State, traced
+from tailgate.engine.program import Call, Program, State
+from tailgate.engine.tracing import traced
 from tailgate.engine.untraceable import Untraceable
 
 FIXED = np.array([[0.5, -0.0, 2.0], [1.0, 3.0, -1.0]])
@@ -46,6 +47,12 @@ def some(x: Any, y: Any, m: Any, n: Any) -> Any:
     return out
 
 
+def kinds(kind: Any) -> Any:
+    """Answers and numbers of a choice among constants, also of one that no choice has."""
+    answers = (kind == 4) * 1.0 + (2 != kind) * 2.0 + (kind == 3) * 4.0 + (kind >= 2) * 8.0  # noqa: SIM300 - both sides
+    return answers + num.take(TABLE[:, 0], kind) * (7 - kind) + np.minimum(kind, np.int8(3)) % 2
+
+
 def branches_on_shapes(x: Any, y: Any, m: Any, n: Any) -> Any:
     if x.ndim == 2 and x.shape[1] == 3 and len(x):
         return x if FIXED[0, 0] > 0 else -x
@@ -67,6 +74,7 @@ CASES: dict[str, Callable[..., Any]] = {
     "remainders by data": lambda x, y, m, n: n % (np.floor(x[:, 0] * 3).astype(np.int64)) + n.astype(np.uint8) % (n.astype(np.uint8) >> 2),
     "bits": lambda x, y, m, n: (x.view(np.int64) & np.int64(0x7FFFFFFFFFFFFFFF)).view(np.float64),
     "where": lambda x, y, m, n: np.where(m, x, np.where(x > 0, 1, n[:, None])),
+    "kinds": lambda x, y, m, n: kinds(np.where(m, np.where(x > 0, 4, 2), np.int8(0)).astype(np.int8)),
     "select": lambda x, y, m, n: np.select([m, x > 0], [x, -x], 4.0),
     "clip": lambda x, y, m, n: np.clip(x, -0.5, 0.5) + x.clip(0.0, 1.0) + np.minimum(x, y[:, :, 0]),
     "logic": lambda x, y, m, n: np.logical_and(x, m) | (np.logical_xor(m, x > 0)) & np.logical_not(n[:, None]),
@@ -189,6 +197,37 @@ def test_numpy_is_itself_elsewhere_and_afterwards() -> None:
     assert np.zeros is before and type(np.asarray([1.0])) is np.ndarray
 
 
+def test_a_choice_among_constants_is_decided_while_it_is_traced() -> None:
+    """A comparison of an attack's kind leaves nothing where no choice has that kind."""
+
+    def function(state: Any, given: Any) -> Any:
+        kind = np.where(given["x"][:, 0] > 0.0, np.where(given["x"][:, 1] > 0.0, 4, 2), 0).astype(np.int8)
+        return (), {"never": kind == 3, "other": kind == 4, "same": np.where(kind == 5, given["x"][:, 0], given["x"][:, 1])}
+
+    trace = traced(function, (), {"x": np.zeros((1, 2))})
+    never, other, same = (trace.results[name].item() for name in ("never", "other", "same"))
+    assert never.op == "const" and not never.attr and other.op == "select" and other.args[2].attr == np.False_
+    assert same is trace.arguments["x"][0, 1]
+
+
+def test_a_pruned_trace_keeps_what_its_results_need() -> None:
+    """A leaf that nothing reads is no part of the program; one that a later step reads is."""
+
+    def function(state: Any, given: Any) -> Any:
+        following = {"total": state["total"] + state["pace"], "pace": state["pace"] * 0.5, "count": state["count"] + 1, "wide": state["wide"] + 1.0}
+        return following, {"out": state["total"]}
+
+    begun = {"total": np.ones(7), "pace": np.full(7, 2.0), "count": np.zeros(7, np.int64), "wide": np.zeros((7, 200))}
+    whole = traced(function, {name: leaf[:1] for name, leaf in begun.items()}, {})
+    assert [set(whole.pruned(keep=keep).state) for keep in ((), ("count",))] == [{"total", "pace"}, {"total", "pace", "count"}]
+    assert set(whole.pruned({}, ["wide"]).state) == {"wide"} == set(whole.pruned({}, ["wide"]).large)
+    program = Program(whole.pruned())
+    state = State(program, 7)
+    state.put(begun)
+    call = Call(program, state)
+    assert [call()["out"].tolist() for _ in range(3)] == [[1.0] * 7, [3.0] * 7, [4.0] * 7]
+
+
 def test_parameters_are_no_part_of_the_code() -> None:
     """A uniform number can be asked for while it is traced; other values need no other code."""
 
@@ -199,7 +238,7 @@ def test_parameters_are_no_part_of_the_code() -> None:
         (k,) = lifted(x, (gain,))
         with functions.makers(graph):
             out = x * (k * 2 + 1) + (1.0 if k > 0 else -1.0) if k < 5 else x
-        from tailgate.engine.program import Trace
+        from tailgate.engine.tracing import Trace
 
         return Program(Trace(graph, {}, {"x": nodes}, {"out": out.nodes}, None))
 

@@ -12,7 +12,8 @@ from tailgate.base.pytree import leaves
 from tailgate.engine import matrices, sweeps
 from tailgate.engine.buffers import WIDE
 from tailgate.engine.evaluation import evaluate
-from tailgate.engine.program import Call, Program, State, traced
+from tailgate.engine.program import Call, Program, State
+from tailgate.engine.tracing import traced
 from tailgate.engine.untraceable import Untraceable
 
 CHANCE = np.random.default_rng(5)

@@ -22,8 +22,9 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
 from tailgate.engine import objects
 from tailgate.engine.evaluation import evaluate
-from tailgate.engine.program import Call, Program, State, traced
+from tailgate.engine.program import Call, Program, State
 from tailgate.engine.remembered import Remembered
+from tailgate.engine.tracing import traced
 from tailgate.envs.gym import programs as seats
 from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.envs.gym.gymnasium_env import AdversaryEnv, AdversaryVectorEnv

@@ -23,8 +23,9 @@ from tailgate.core.draws import Keys
 from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
 from tailgate.engine.operations import Array, ArrayLike
 from tailgate.engine.parameters import lifted
-from tailgate.engine.program import Call, Trace, program_class, traced
+from tailgate.engine.program import Call, program_class
 from tailgate.engine.remembered import Remembered
+from tailgate.engine.tracing import Trace, traced
 
 if TYPE_CHECKING:
     from tailgate.core.loop import LoopState

@@ -29,7 +29,8 @@ class Code:
     """Machine code of a function from arrays of one type to a tuple of arrays of one type."""
 
     def __init__(self, function: Callable[..., Sequence[Array]], dtype: DTypeLike, inputs: int) -> None:
-        from tailgate.engine.program import Program, traced  # a circular import otherwise
+        from tailgate.engine.program import Program  # a circular import otherwise
+        from tailgate.engine.tracing import traced
 
         def named(state: None, given: dict[str, Array]) -> tuple[None, dict[str, Array]]:
             return state, {str(i): x for i, x in enumerate(function(*given.values()))}
@@ -128,8 +129,9 @@ class Shaped:
 
     def _code(self, given: Arguments, constants: Arguments, shapes: Hashable) -> tuple[Program | None, Array]:
         from tailgate.engine.parameters import Parameters, lifted
-        from tailgate.engine.program import Program, traced
+        from tailgate.engine.program import Program
         from tailgate.engine.remembered import Answers
+        from tailgate.engine.tracing import traced
 
         parameters = Parameters(constants)
         _shortened(self._made)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -40,9 +40,9 @@ class Evaluation:
         """The number of operations."""
         return sum(not node.fixed for node in self._order)
 
-    def __call__(self, inputs: dict[Any, Any]) -> list[Any]:
-        """Return the values of the roots."""
-        self._inputs, self._values = inputs, dict(self._fixed)
+    def __call__(self, inputs: dict[Any, Any], known: Mapping[int, Any] | None = None) -> list[Any]:
+        """Return the values of the roots. known: values of nodes that are computed elsewhere, by number."""
+        self._inputs, self._values = inputs, {**self._fixed, **(known or {})}
         with np.errstate(all="ignore"):
             self._run(self._order)
         return [self._value(root) for root in self.roots]

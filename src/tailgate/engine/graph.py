@@ -171,6 +171,10 @@ class Graph:
         dtype = BOOL if op in COMPARISONS else x.dtype
         if same := _identity(op, x, y):
             return same
+        if _is_choice(x) and y.op == "const":
+            return self.select(x.args[0], *(self.binary(op, one, y) for one in x.args[1:]))
+        if _is_choice(y) and x.op == "const":
+            return self.select(y.args[0], *(self.binary(op, x, one) for one in y.args[1:]))
         if op in COMMUTATIVE and x.id > y.id:
             x, y = y, x
         return self._folded(op, dtype, (x, y))
@@ -197,6 +201,8 @@ class Graph:
 
     def cast(self, x: Node, dtype: np.dtype[Any]) -> Node:
         """Convert x to another type."""
+        if _is_choice(x) and x.dtype != dtype:
+            return self.select(x.args[0], *(self.cast(one, dtype) for one in x.args[1:]))
         return x if x.dtype == dtype else self._folded("cast", dtype, (x,))
 
     def bits(self, x: Node, dtype: np.dtype[Any]) -> Node:
@@ -223,7 +229,10 @@ class Graph:
         """Return table[index] of fixed nodes of one type; the index is limited to the table."""
         last = self.const(len(table) - 1, INT)
         within = self.binary("min", self.binary("max", self.cast(index, INT), self.const(0, INT)), last)
-        return self._node("gather", table[0].dtype, (within,), tuple(table), tuple(node.id for node in table), False)
+        if _is_choice(within):
+            return self.select(within.args[0], *(self.gather(table, one) for one in within.args[1:]))
+        found = tuple(table), tuple(node.id for node in table)
+        return table[int(within.attr)] if within.op == "const" else self._node("gather", table[0].dtype, (within,), *found, False)
 
     # -- matrices
 
@@ -309,6 +318,11 @@ class Graph:
             with np.errstate(all="ignore"):
                 return self.const(apply(op, dtype, [a.attr for a in args]), dtype)
         return self._node(op, dtype, args, None, None, all(a.fixed for a in args))
+
+
+def _is_choice(node: Node) -> bool:
+    """Return True for a choice among constant whole numbers, such as kinds of an attack: what depends on it alone is a choice too."""
+    return node.op == "select" and node.dtype.kind in "iu" and all(one.op == "const" or _is_choice(one) for one in node.args[1:])
 
 
 def _is(node: Node, value: float) -> bool:

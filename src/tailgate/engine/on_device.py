@@ -21,7 +21,8 @@ from tailgate.engine.cuda_parts import LANES
 from tailgate.engine.layout import Layout
 from tailgate.engine.operations import Array
 from tailgate.engine.passes import LEAST
-from tailgate.engine.program import Call, Program, State, Trace
+from tailgate.engine.program import Call, Program, State
+from tailgate.engine.tracing import Trace
 
 VERSION = "1"  # of this module's translation
 SPARE = 0.95  # of the free memory that rows may take

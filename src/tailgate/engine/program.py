@@ -13,7 +13,6 @@ import operator
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, NamedTuple, TypeVar
 
@@ -22,93 +21,18 @@ import numpy as np
 from tailgate.base.errors import InputError
 from tailgate.base.pytree import leaves, map_leaves
 from tailgate.engine import objects
-from tailgate.engine.array import Traced, lifted
-from tailgate.engine.buffers import WIDE, buffer_of, copied
-from tailgate.engine.functions import makers
-from tailgate.engine.graph import Graph, Node
 from tailgate.engine.hints import broken
 from tailgate.engine.layout import Column, Held, Layout
 from tailgate.engine.llvm import text_of
 from tailgate.engine.operations import Array, DTypeLike
 from tailgate.engine.parameters import Reading
 from tailgate.engine.passes import LEAST
+from tailgate.engine.tracing import Trace
 
 _PYTHON = {"f": "d", "b": "?", "i": "q"}  # Python's format of 64-bit numbers and truth values
 WORTH = 2048  # episodes per thread
 ALIGNED = 64  # bytes of a cache line
-S = TypeVar("S")
-G = TypeVar("G")
 T = TypeVar("T")
-
-
-@dataclass(eq=False)
-class Trace:
-    """The computation of a function, as nodes by leaf. The result `demands` (B, .) holds the conditions of the code."""
-
-    graph: Graph
-    state: dict[str, tuple[Array, Array]]  # leaf -> its nodes, and those of the next state
-    arguments: dict[str, Array]
-    results: dict[str, Array]
-    next_state: Any  # the tree, with traced leaves
-    large: dict[str, tuple[Node, Node]] = field(default_factory=dict)  # of leaves that are buffers: now and next
-
-
-def traced(function: Callable[[S, G], tuple[S, Mapping[str, Array]]], state: S, arguments: G) -> Trace:
-    """Trace function(state, arguments) -> (state, results), with trees of example arrays (B, ...)."""
-    graph = Graph()
-    inside, taken = _inputs(graph, state, "state"), _inputs(graph, arguments, "arguments")
-    with makers(graph):
-        following, made = function(inside, taken)
-        following = map_leaves(lambda leaf, like: lifted(graph, leaf, like.dtype).astype(like.dtype), following, inside)
-        results = {name: lifted(graph, leaf) for name, leaf in made.items()}
-    before, after = _nodes(inside), _nodes(following)
-    for name, leaf in before.items():
-        if after[name].shape != leaf.shape:
-            raise ValueError(f"state {name}: {after[name].shape} after a step, {leaf.shape} before it")
-    held = {name: (leaf, after[name]) for name, leaf in before.items()}
-    large = {}
-    for name, (here, there) in held.items():
-        if here.size >= WIDE:
-            place: Node = here.flat[0].args[0]
-            large[name] = place, _own(graph, place, buffer_of(graph, there))
-    if graph.demands:
-        results = results | {"demands": Traced(graph, np.array([[node for *_, node in graph.demands]], object), np.dtype(bool), 0)}
-    args, given = _nodes(taken), {name: _of_each(leaf) for name, leaf in results.items()}
-    return Trace(graph, held, args, _nodes(given), following, large)
-
-
-def _own(graph: Graph, place: Node, new: Node) -> Node:
-    """Return the next numbers of a place in the state, copied if they may alias another place that is written too."""
-
-    def borrowed(node: Node) -> bool:
-        return (node.op == "held" and node is not place) or (node.op == "blend" and any(borrowed(a) for a in node.args[1:]))
-
-    return copied(graph, new) if borrowed(new) else new
-
-
-def _inputs(graph: Graph, tree: T, kind: str) -> T:
-    """Return the tree with an input for each number of each leaf."""
-    names = iter(leaves(tree))
-
-    def leaf(x: Array) -> Traced:
-        name, nodes = next(names), np.empty((1, *x.shape[1:]), object)
-        if kind == "state" and nodes.size >= WIDE:
-            held = graph.picks(graph.held((kind, name), nodes.size, x.dtype)).reshape(nodes.shape)
-            return Traced(graph, held, x.dtype, 0, writeable=False)
-        for place in np.ndindex(*x.shape[1:]):
-            nodes[(0, *place)] = graph.input((kind, name, place), x.dtype)
-        return Traced(graph, nodes, x.dtype, 0, writeable=False)
-
-    return map_leaves(leaf, tree)
-
-
-def _nodes(tree: object) -> dict[str, Array]:
-    return {name: leaf.nodes for name, leaf in leaves(tree).items() if isinstance(leaf, Traced)}
-
-
-def _of_each(leaf: Traced) -> Traced:
-    """Return a result with the episodes first."""
-    return leaf if leaf.ndim and leaf.shape[0] == 1 else Traced(leaf.graph, leaf.nodes[None], leaf.dtype)
 
 
 class Program:
@@ -212,9 +136,10 @@ class State:
         return raw.view(dtype).reshape(self.blocks, nodes.size, program.lanes)
 
     def put(self, tree: object, rows: Array | None = None) -> None:
-        """Write the leaves of a tree, arrays (episodes, ...), or `rows` (R,) of them. Idle lanes repeat the last row."""
+        """Write those leaves of a tree that the program has, (episodes, ...), or `rows` (R,) of them. Idle lanes repeat the last row."""
         for name, leaf in leaves(tree).items():
-            self.put_leaf(name, leaf, rows)
+            if name in self.program.places:
+                self.put_leaf(name, leaf, rows)
 
     def put_leaf(self, name: str, leaf: Array, rows: Array | None = None) -> None:
         """Write one leaf, as `put` does."""

@@ -1,28 +1,27 @@
 """The torch form of a trace: the same numbers, with derivatives. It is not the scored path.
 
-Numbers that no differentiated argument reaches stay numpy's; the others are float64 tensors on the processor.
+Machine code computes the numbers that no differentiated argument reaches; the others are float64 tensors on the processor.
 Each operation gives the bits that numpy gives. Comparisons, roundings and conversions to whole numbers have derivative 0.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
-from tailgate.engine.compiled import Code
 from tailgate.engine.evaluation import Evaluation, multiplied
 from tailgate.engine.graph import Graph, Node, computed
 from tailgate.engine.operations import COMPARISONS, FLOAT, Array
-from tailgate.engine.program import Trace
+from tailgate.engine.program import Program
+from tailgate.engine.tracing import Trace
 
 try:
     import torch as torch  # for those who differentiate
 except ImportError as error:
     raise ImportError("derivatives of a loop need PyTorch: pip install 'tailgate[train]'") from error
 
-LONG = 100  # nodes of a routine that is worth machine code
 Rule = Callable[[torch.Tensor], tuple[torch.Tensor, ...]]
 _FLAT = {"floor", "ceil", "trunc", "rint", "not", "bits", *COMPARISONS}  # operations with derivative 0
 _DERIVATIVES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {"log": torch.reciprocal}  # of routines on the bits of a number
@@ -69,10 +68,12 @@ def _differentiated(args: Sequence[Any]) -> bool:
 class TorchEvaluation(Evaluation):
     """The values of some roots; tensors among the inputs (B,) are differentiated."""
 
-    def __init__(self, graph: Graph, roots: Sequence[Node]) -> None:
+    def __init__(self, graph: Graph, roots: Sequence[Node], moving: Container[int] | None = None) -> None:
+        """Take the graph and its roots; `moving` has the numbers of the nodes to compute, the others are given."""
         super().__init__(graph, roots)
+        if moving is not None:
+            self._order = [node for node in self._order if node.id in moving]
         self._parts_of: dict[int, tuple[torch.Tensor, Sequence[torch.Tensor]]] = {}
-        self._codes: dict[int, Code] = {}
 
     def compute(self, node: Node, args: Sequence[Any]) -> Any:
         """Return the value of an operation: a tensor if one of its arguments is one and the operation has a derivative."""
@@ -134,21 +135,13 @@ class TorchEvaluation(Evaluation):
         return held[1]
 
     def call(self, routine: Any, args: Sequence[Any]) -> list[Any]:
-        """Return the results of a routine: by machine code where nothing is differentiated, as in random numbers."""
-        if not _differentiated(args):
-            return self._drawn(routine, args) if routine.cost > LONG else super().call(routine, args)
-        if derivative := _DERIVATIVES.get(routine.name):  # its operations on bits would not show it
+        """Return the results of a routine."""
+        derivative = _DERIVATIVES.get(routine.name)  # its operations on bits would not show it
+        if derivative and _differentiated(args):
             (x,) = args
             slope = derivative(x.detach())
             return [ruled(value, lambda grad: (grad * slope,), x) for value in routine.values([plain(x)])]
         return super().call(routine, args)
-
-    def _drawn(self, routine: Any, args: Sequence[Any]) -> list[Any]:
-        arrays = np.broadcast_arrays(*args)
-        if id(routine) not in self._codes:
-            self._codes[id(routine)] = Code(routine.function, arrays[0].dtype, len(arrays))
-        made = self._codes[id(routine)](np.stack(arrays).reshape(len(arrays), -1))
-        return list(made.reshape(-1, *arrays[0].shape))
 
 
 def _select(where: Any, x: Any, y: Any) -> torch.Tensor:
@@ -216,7 +209,7 @@ _OPERATIONS: dict[str, Callable[..., Any]] = {
 
 
 class TorchForm:
-    """The steps of a trace. The state is a mapping from the names of inputs to numbers (B,), tensors where they are differentiated."""
+    """The steps of a trace. Only what a differentiated argument reaches is torch; machine code computes the other numbers, once."""
 
     def __init__(self, trace: Trace, results: Sequence[str]) -> None:
         """Keep what the named results of all steps need.
@@ -226,52 +219,91 @@ class TorchForm:
         trace : of a function that maps a state and arguments to the next state and results
         results : names of results, one number of an episode each
         """
-        following: dict[int, tuple[Any, Node]] = {}
-        for name, (here, there) in trace.state.items():
-            pairs = [trace.large[name]] if name in trace.large else zip(here.flat, there.flat, strict=True)
-            following |= {now.id: (now.attr, new) for now, new in pairs}
-        self._arguments, self._results = trace.arguments, tuple(results)
-        asked = [trace.results[name].item() for name in results]
-        self._state = _needed(asked, following)
-        self._evaluation = TorchEvaluation(trace.graph, [*asked, *self._state.values()])
-        self._large = {now.attr for now, _ in trace.large.values()}
+        following = {now.id: (now.attr, new) for name in trace.state for now, new in trace.pairs(name)}
+        asked = {name: trace.results[name].item() for name in results}
+        needed = _needed(asked.values(), following)
+        moving = _moving(needed, [node for nodes in trace.arguments.values() for node in nodes.flat], following)
+        self._arguments, self._large = trace.arguments, {now.attr for now, _ in trace.large.values()}
+        self._state = {name: new for i, (name, new) in following.items() if i in moving}
+        self._results = {name: node for name, node in asked.items() if node.id in moving}
+        self._evaluation = TorchEvaluation(trace.graph, [*self._results.values(), *self._state.values()], moving)
+        given = {a.id: a for node in needed if node.id in moving for a in node.args if not a.fixed and a.id not in moving}
+        self._given: dict[str, list[Node]] = {}  # what machine code hands over, by type
+        for node in given.values():
+            self._given.setdefault(f"given {node.dtype}", []).append(node)
+        self._program = _program(trace, {name: node for name, node in asked.items() if node.id not in moving}, self._given)
 
     @property
     def operations(self) -> int:
-        """The operations of a step."""
-        return self._evaluation.operations
+        """The numbers that derivatives keep of a step, about."""
+        return self._evaluation.operations + sum(node.size or 1 for nodes in self._given.values() for node in nodes)
 
-    def start(self, leaves: dict[str, Array]) -> dict[Any, Any]:
-        """Return the state for its leaves (B, ...) by dotted name."""
-        out = {}
-        for name in self._state:
+    def start(self, leaves: dict[str, Array]) -> Differentiated:
+        """Return episodes that begin with these leaves (B, ...), by dotted name."""
+        return Differentiated(self, leaves)
+
+
+class Differentiated:
+    """Episodes that are played with derivatives."""
+
+    def __init__(self, form: TorchForm, leaves: dict[str, Array]) -> None:
+        self._form, self._moving = form, {}
+        for name in form._state:
             leaf = leaves[name[1]]
-            out[name] = np.array(leaf.reshape(len(leaf), -1).T if name in self._large else leaf[(slice(None), *name[2])], order="C")
-        return out
+            numbers = leaf.reshape(len(leaf), -1).T if name in form._large else leaf[(slice(None), *name[2])]
+            self._moving[name] = np.array(numbers, order="C")
+        state = form._program.rows(len(next(iter(leaves.values()))))
+        for name in form._program.places:
+            state.put_leaf(name, leaves[name])
+        self._call = form._program.call(state)
 
-    def step(self, state: dict[Any, Any], arguments: dict[str, Any]) -> tuple[dict[Any, Any], dict[str, Any]]:
-        """Return the next state and the results (B,), for arguments (B, ...), arrays or tensors."""
-        given = dict(state)
-        for name, nodes in self._arguments.items():
+    def step(self, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Play a step; return the results (B,), for arguments (B, ...), arrays or tensors."""
+        form, given = self._form, dict(self._moving)
+        for name, nodes in form._arguments.items():
+            self._call.arguments[name][...] = plain(arguments[name])
             for place in np.ndindex(*nodes.shape[1:]):
                 given[nodes[(0, *place)].attr] = arguments[name][(slice(None), *place)]
-        made = self._evaluation(given)
-        count = len(self._results)
-        return dict(zip(self._state, made[count:], strict=True)), dict(zip(self._results, made[:count], strict=True))
+        made = self._call()
+        known: dict[int, Any] = {}
+        for name, given_here in form._given.items():
+            columns = iter(made.pop(name).T)
+            known |= {node.id: np.array([next(columns) for _ in range(node.size)]) if node.size else next(columns) for node in given_here}
+        found = form._evaluation(given, known)
+        self._moving = dict(zip(form._state, found[len(form._results) :], strict=True))
+        return made | dict(zip(form._results, found, strict=False))
 
 
-def _needed(asked: Sequence[Node], following: dict[int, tuple[Any, Node]]) -> dict[Any, Node]:
-    """Return, by input, the nodes of the next state that the asked nodes need, now or in a later step."""
-    out: dict[Any, Node] = {}
-    left, seen = list(asked), set()
+def _program(trace: Trace, results: dict[str, Node], given: dict[str, list[Node]]) -> Program:
+    """Return the machine code of named numbers, and of groups of numbers and buffers."""
+    wanted = {name: np.array([node], object) for name, node in results.items()}
+    for name, nodes in given.items():
+        wanted[name] = np.array([[one for node in nodes for one in (trace.graph.picks(node) if node.size else [node])]], object)
+    return Program(trace.pruned(wanted))
+
+
+def _needed(asked: Iterable[Node], following: dict[int, tuple[Any, Node]]) -> list[Node]:
+    """Return what the asked nodes need, now or in a later step, arguments first."""
+    left, seen = list(asked), {}
     while left:
         node = left.pop()
         if node.id in seen:
             continue
-        seen.add(node.id)
+        seen[node.id] = node
         left.extend(node.args)
         if node.id in following:
-            name, new = following[node.id]
-            out[name] = new
-            left.append(new)
-    return out
+            left.append(following[node.id][1])
+    return [seen[i] for i in sorted(seen)]
+
+
+def _moving(nodes: Sequence[Node], arguments: Sequence[Node], following: dict[int, tuple[Any, Node]]) -> set[int]:
+    """Return the numbers of the nodes that the arguments reach, now or in a later step, on a way with derivatives."""
+    moving, before = {node.id for node in arguments}, -1
+    while len(moving) > before:
+        before = len(moving)
+        for node in nodes:
+            through = node.op in ("call", "loop") or (node.dtype == FLOAT and node.op not in _FLAT)
+            if through and any(a.id in moving for a in node.args):
+                moving.add(node.id)
+        moving |= {i for i, (_, new) in following.items() if new.id in moving}
+    return moving

@@ -18,10 +18,12 @@ from tailgate.core.loop import Loop
 from tailgate.core.threat import Brief
 from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
 from tailgate.engine.parameters import lifted
-from tailgate.engine.program import Call, Program, State, traced
+from tailgate.engine.program import Call, Program, State
 from tailgate.engine.remembered import Remembered
+from tailgate.engine.tracing import traced
 from tailgate.ensemble.space import TRIGGERS, Rows, Sequence
 
+OUTCOME = "loop.ended", "gap", "error", "moved"  # of `Played`, in the state
 STEPS = 32  # between two looks whether an episode is left
 NEAR, FAST, SLOW, CLOSING, BRAKING = (TRIGGERS.index(name) for name in ("near", "speed", "slow", "closing", "leader_braking"))
 _ONE = Keys(np.zeros((1, 3), np.uint64), np.zeros(1, np.uint32))
@@ -114,7 +116,7 @@ class Battery:
     def __init__(self, loop: Loop, attack: Decider, plan: object, like: object) -> None:
         check_open(loop)
         self.loop, self.attack, self.plan, self.values = loop, attack, plan, None
-        self.program = Program(traced(self._traced, begun(loop, _ONE, like), {}))
+        self.program = Program(traced(self._traced, begun(loop, _ONE, like), {}).pruned(keep=OUTCOME))
         self.programs = (self.program,)
 
     def of(self, loop: Loop, attack: Decider, plan: object, values: list[Array] | None) -> Battery:
@@ -152,7 +154,7 @@ class Episodes:
         while done < self.horizon and not state.get_leaf("loop.ended").all():
             call.play(min(STEPS, self.horizon - done))
             done, self.broken = done + STEPS, self.broken or call.broken
-        return Played(*(state.get_leaf(name) for name in ("loop.ended", "gap", "error", "moved")))
+        return Played(*(state.get_leaf(name) for name in OUTCOME))
 
 
 def begun(loop: Loop, keys: Keys, memory: object) -> dict[str, Any]:
@@ -225,7 +227,8 @@ def _difference(made: Battery, few: object) -> str:
         if isinstance(found, str):
             return "" if not results["demands"].all() else f"step {number + 1}: {found}"
         plain = found[0]
-        for name, leaf in leaves(plain).items():
-            if not same(state.get_leaf(name), leaf):
+        held = leaves(plain)
+        for name in made.program.places:
+            if not same(state.get_leaf(name), held[name]):
                 return f"{name}, step {number + 1}"
     return ""

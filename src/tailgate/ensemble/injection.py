@@ -18,8 +18,8 @@ from tailgate.core import Array, Kind
 from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import Loop
 from tailgate.engine.parameters import lifted
-from tailgate.engine.program import traced
 from tailgate.engine.torch_form import TorchForm, tensor, torch
+from tailgate.engine.tracing import traced
 
 
 class Course(NamedTuple):
@@ -80,7 +80,7 @@ class Injection:
             With derivatives for the schedule. It ends early when all episodes have.
         """
         begun, batch = self._begun(keys), len(keys.key)
-        state, on, count = self._form.start(leaves(begun)), begun["on"], begun["count"]
+        episodes, on, count = self._form.start(leaves(begun)), begun["on"], begun["count"]
         rows, granted = torch.arange(batch), tensor(self.loop.brief.granted)
         columns: dict[str, list[Any]] = {"gap": [], "error": [], "live": []}
         with single_thread():
@@ -90,9 +90,9 @@ class Injection:
                 value: Any = np.zeros(sent.shape)
                 if sent.any():
                     value = torch.where(sent, schedule[place] if schedule.ndim == 3 else schedule[rows, place], 0.0)
-                state, made = self._form.step(state, {"value": value})
-                on, count = np.broadcast_to(made["on"], batch), np.broadcast_to(made["count"], batch)
-                columns["live"].append(np.broadcast_to(~made["over"], batch))
+                made = episodes.step({"value": value})
+                on, count = made["on"], made["count"]
+                columns["live"].append(~made["over"])
                 for name in ("gap", "error"):
                     columns[name].append(tensor(made[name]).expand(batch))
                 if made["over"].all():

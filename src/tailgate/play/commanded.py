@@ -17,8 +17,9 @@ from tailgate.core.loop import Loop, LoopState
 from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
 from tailgate.engine.cards import device
 from tailgate.engine.parameters import lifted
-from tailgate.engine.program import program_class, traced
+from tailgate.engine.program import program_class
 from tailgate.engine.remembered import Remembered
+from tailgate.engine.tracing import traced
 from tailgate.play.trace import Recorder, signals_of
 
 

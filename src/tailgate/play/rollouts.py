@@ -15,8 +15,9 @@ from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised,
 from tailgate.engine.cards import device
 from tailgate.engine.operations import Array
 from tailgate.engine.parameters import lifted
-from tailgate.engine.program import program_class, traced
+from tailgate.engine.program import program_class
 from tailgate.engine.remembered import Remembered
+from tailgate.engine.tracing import traced
 
 STEPS = 32  # between checks if all episodes have ended
 
@@ -35,7 +36,7 @@ class Rollout:
         check_open(loop)
         self.loop, self.attack, self.plan = loop, attack, plan
         self.values: list[Array] | None = None  # of the parameters, if they differ from the traced ones
-        self.program = program_class(device())(traced(self._traced, self.begun(_ONE), None))
+        self.program = program_class(device())(traced(self._traced, self.begun(_ONE), None).pruned(keep=["loop.ended"]))
         self.programs = (self.program,)
 
     def of(self, loop: Loop, attack: Attack, plan: object, values: list[Array]) -> Rollout:
@@ -137,8 +138,9 @@ def _difference(rollout: Rollout, batch: int = ROWS) -> str:
         if isinstance(found, str):
             return "" if not results["demands"].all() else f"step {step + 1}: {found}"
         plain, wanted = found
-        for name, leaf in (leaves(plain) | wanted).items():
-            got = results[name] if name in wanted else state.get_leaf(name)
-            if not same(got, leaf):
+        held = leaves(plain)
+        got = results | {name: state.get_leaf(name) for name in rollout.program.places}
+        for name in (*rollout.program.places, *wanted):
+            if not same(got[name], (held | wanted)[name]):
                 return f"{name}, step {step + 1}"
     return ""
