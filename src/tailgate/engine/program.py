@@ -154,6 +154,10 @@ class State:
             place[whole, :, : self.episodes - whole * lanes] = numbers[:, whole * lanes :]
             place[whole, :, self.episodes - whole * lanes :] = numbers[:, -1:]
 
+    def every(self, name: str) -> bool:
+        """Return True if a leaf of truth values is true in all episodes."""
+        return bool(self._leaf(name).all())
+
     def get(self, like: T) -> T:
         """Return a copy as a tree of arrays (episodes, ...)."""
         names = iter(leaves(like))

@@ -151,7 +151,7 @@ class Episodes:
         state.memory[...] = self._first
         call.uniforms[...] = self.battery.program.uniforms(values)
         call.begin()
-        while done < self.horizon and not state.get_leaf("loop.ended").all():
+        while done < self.horizon and not state.every("loop.ended"):
             call.play(min(STEPS, self.horizon - done))
             done, self.broken = done + STEPS, self.broken or call.broken
         return Played(*(state.get_leaf(name) for name in OUTCOME))

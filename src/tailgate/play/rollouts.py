@@ -68,7 +68,7 @@ class Rollout:
         call.begin()
         signals, done = call.results(), 0
         demands, ended = signals.pop("demands"), signals.pop("ended")
-        while done < loop.horizon and not (terminate and done and ended[done - 1].all() and state.get_leaf("loop.ended").all()):
+        while done < loop.horizon and not (terminate and done and ended[done - 1].all() and state.every("loop.ended")):
             steps = min(STEPS, loop.horizon - done)
             call.play(steps)
             if call.broken:
