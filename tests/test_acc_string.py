@@ -82,7 +82,7 @@ def test_nobody_collides_or_brakes_in_an_emergency_without_an_attack(name):
 
 @pytest.mark.parametrize("speed, accel, decel, jerk", [row[1:] for row in ISO], ids=[row[0] for row in ISO])
 def test_commands_stay_within_iso_15622(speed, accel, decel, jerk):
-    law = make("controller", "acc_production", delay=0.0, set_speed=200.0)
+    law = make("controller", "acc_production", delay=0.0, set_speed=100.0)
     assert command(law, 500.0, 30.0, speed)[0] == pytest.approx(accel)
     braking = command(law, 1.0, -10.0, speed, steps=80)
     assert braking[0] == pytest.approx(-0.05 * jerk) and braking[-1] == pytest.approx(-decel)

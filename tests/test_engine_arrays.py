@@ -210,6 +210,23 @@ def test_a_choice_among_constants_is_decided_while_it_is_traced() -> None:
     assert same is trace.arguments["x"][0, 1]
 
 
+def test_choices_do_not_multiply() -> None:
+    """A counter of thirty questions has as many operations as its lines, not one for each way through them."""
+
+    def function(state: Any, given: Any) -> Any:
+        count = np.zeros(1, np.int64)
+        for k in range(30):
+            count = np.where(given["x"][:, 0] > k, count + 1, count)
+        return (), {"count": count}
+
+    trace = traced(function, (), {"x": np.zeros((1, 1))})
+    assert trace.graph.operations < 120
+    program = Program(trace)
+    call = Call(program, State(program, 40))
+    call.arguments["x"][:, 0] = np.arange(40) - 4.5
+    assert call()["count"].tolist() == np.clip(np.arange(40) - 4, 0, 30).tolist()
+
+
 def test_a_pruned_trace_keeps_what_its_results_need() -> None:
     """A leaf that nothing reads is no part of the program; one that a later step reads is."""
 

@@ -29,8 +29,8 @@ Time = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]  # [s]
 Position = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]  # [m]
 Length = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]  # [m]
 Gap = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]  # [m]: at 0 two cars touch
-Speed = Annotated[float, Field(ge=0, le=1e3, allow_inf_nan=False)]  # [m/s]
-PositiveSpeed = Annotated[float, Field(ge=1e-3, le=1e3, allow_inf_nan=False)]  # [m/s]
+Speed = Annotated[float, Field(ge=0, le=100.0, allow_inf_nan=False)]  # [m/s]
+PositiveSpeed = Annotated[float, Field(ge=1e-3, le=100.0, allow_inf_nan=False)]  # [m/s]: 360 km/h; a number above is of another unit
 Accel = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]  # [m/s^2]
 Rate = Annotated[float, Field(gt=0, le=1e3, allow_inf_nan=False)]  # size of an acceleration or deceleration [m/s^2]
 Gain = Annotated[float, Field(ge=0, le=1e3, allow_inf_nan=False)]

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from tailgate.engine.folding import identity, is_choice
 from tailgate.engine.operations import BOOL, COMMUTATIVE, COMPARISONS, FLOAT, INT, Array, ArrayLike, apply, converted
 from tailgate.engine.untraceable import Untraceable
 
@@ -169,11 +170,11 @@ class Graph:
         if x.dtype != y.dtype:
             raise TypeError(f"{op} of {x.dtype} and {y.dtype}")
         dtype = BOOL if op in COMPARISONS else x.dtype
-        if same := _identity(op, x, y):
+        if same := identity(op, x, y):
             return same
-        if _is_choice(x) and y.op == "const":
+        if is_choice(x) and y.op == "const":
             return self.select(x.args[0], *(self.binary(op, one, y) for one in x.args[1:]))
-        if _is_choice(y) and x.op == "const":
+        if is_choice(y) and x.op == "const":
             return self.select(y.args[0], *(self.binary(op, x, one) for one in y.args[1:]))
         if op in COMMUTATIVE and x.id > y.id:
             x, y = y, x
@@ -201,7 +202,7 @@ class Graph:
 
     def cast(self, x: Node, dtype: np.dtype[Any]) -> Node:
         """Convert x to another type."""
-        if _is_choice(x) and x.dtype != dtype:
+        if is_choice(x) and x.dtype != dtype:
             return self.select(x.args[0], *(self.cast(one, dtype) for one in x.args[1:]))
         return x if x.dtype == dtype else self._folded("cast", dtype, (x,))
 
@@ -229,7 +230,7 @@ class Graph:
         """Return table[index] of fixed nodes of one type; the index is limited to the table."""
         last = self.const(len(table) - 1, INT)
         within = self.binary("min", self.binary("max", self.cast(index, INT), self.const(0, INT)), last)
-        if _is_choice(within):
+        if is_choice(within):
             return self.select(within.args[0], *(self.gather(table, one) for one in within.args[1:]))
         found = tuple(table), tuple(node.id for node in table)
         return table[int(within.attr)] if within.op == "const" else self._node("gather", table[0].dtype, (within,), *found, False)
@@ -318,35 +319,6 @@ class Graph:
             with np.errstate(all="ignore"):
                 return self.const(apply(op, dtype, [a.attr for a in args]), dtype)
         return self._node(op, dtype, args, None, None, all(a.fixed for a in args))
-
-
-def _is_choice(node: Node) -> bool:
-    """Return True for a choice among constant whole numbers, such as kinds of an attack: what depends on it alone is a choice too."""
-    return node.op == "select" and node.dtype.kind in "iu" and all(one.op == "const" or _is_choice(one) for one in node.args[1:])
-
-
-def _is(node: Node, value: float) -> bool:
-    """Return True if the node is this constant; 0.0 and -0.0 differ."""
-    return node.op == "const" and node.attr == value and bool(np.signbit(node.attr)) == (str(value)[0] == "-")
-
-
-def _identity(op: str, x: Node, y: Node) -> Node | None:
-    """Return x op y if it needs no computation and keeps every bit; else None."""
-    kind = x.dtype.kind
-    if kind == "f":
-        if (op in ("mul", "div") and _is(y, 1.0)) or (op == "sub" and _is(y, 0.0)) or (op == "add" and _is(y, -0.0)):
-            return x
-        return y if (op == "mul" and _is(x, 1.0)) or (op == "add" and _is(x, -0.0)) else None
-    if kind == "b" and op in ("and", "or"):
-        for this, other in ((x, y), (y, x)):
-            if this.op == "const":
-                return other if bool(this.attr) == (op == "and") else this
-    elif kind in "iu" and op in ("add", "or", "xor", "shl", "shr"):
-        if y.op == "const" and y.attr == 0:
-            return x
-        if x.op == "const" and x.attr == 0 and op in ("add", "or", "xor"):
-            return y
-    return x if x is y and op in ("and", "or", "min", "max") else None
 
 
 def computed(node: Node, args: Sequence[Any]) -> Any:
