@@ -31,6 +31,15 @@ def test_lines_have_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
     ]  # fmt: skip
 
 
+def test_a_label_that_is_used_again_begins_again() -> None:
+    """As for the next defence of a board."""
+    out = io.StringIO()
+    with progress.progress(Console(file=out)) as update:
+        for done in (0, 6, 0, 3, 3, 6):
+            update("searches", done, 6, f"{done} of 6")
+    assert out.getvalue().splitlines() == ["searches: 100 % 6 of 6", "searches: 50 % 3 of 6", "searches: 100 % 6 of 6"]
+
+
 def test_searches_in_other_processes_are_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A search notes its percent in a file, which is read while it runs and removed in the end."""
     job: Any = type("Job", (), {"name": "one"})()

@@ -27,7 +27,8 @@ def silent() -> Iterator[None]:
 def progress(shown_on: Console) -> Iterator[Update]:
     """Yield a function update(label, done, total, figures); each label has one bar.
 
-    Lines have the time since the label's first update, and from a minute on the time left at the pace since then.
+    Lines have the time since the label's first update, and from a minute on the time left at the pace since then. A label begins again
+    where less is done than before.
     """
     if _silent.get():
         yield lambda *_: None
@@ -38,6 +39,8 @@ def progress(shown_on: Console) -> Iterator[Update]:
 
         def line(label: str, done: int, total: int, figures: str = "") -> None:
             now, tenth = time.monotonic(), 10 * done // max(total, 1)
+            if tenth < shown.get(label, 0):
+                del shown[label], begun[label]
             since, before = begun.setdefault(label, (now, done))
             if tenth > shown.get(label, 0):
                 shown[label] = tenth

@@ -35,7 +35,6 @@ SPEEDS = {"median": 0.5, "q90": 0.9, "most": 1.0}  # quantiles of impact speeds
 VAGUE = "the board does not say which episodes came to damage"
 NO_IMPACT = "no collision"
 NO_IMPACT_SPEED = "collisions from behind alone, of which no speed is recorded"
-NO_DISTANCE = "it covers no distance in clean runs"
 
 
 def pointwise(worst: Worst, dose: int) -> Data:

@@ -96,9 +96,13 @@ def _run(options: argparse.Namespace) -> int:
                 suite, folder, beacon=options.beacon or None, keep=options.keep_entries, require_adaptive=not options.unattacked
             )
             left = [entry["defence"] for entry in board["entries"] if entry["status"] == "unattacked"] if options.train else []
-            for defence in left:
+            for number, defence in enumerate(left, start=1):
+
+                def numbered(label: str, *rest: Any, head: str = f"{number} of {len(left)}, {defence}") -> None:
+                    update(f"{head}: {label}", *rest)
+
                 attack(
-                    suite, defence, folder / "attacked", beacon=options.beacon, workers=options.workers, progress=update,
+                    suite, defence, folder / "attacked", beacon=options.beacon, workers=options.workers, progress=numbered,
                     counting=record.counting,
                 )  # fmt: skip
             if left:
