@@ -62,7 +62,7 @@ SMALL = {  # options that make a command small
     "tailgate distil": "--episodes 20",
     "tailgate calibrate": "--onsets 5",
     "tailgate detect-log": "",
-    "tailgate learn-envelope": "--episodes 200 --held-out 100",
+    "tailgate learn-envelope": "--episodes 200 --held-out 160",
     "tailgate learn-envelope --log": "",
     "tailgate log": "--attack none --defence kf --episodes 60 --dev-episodes 20",
     "tailgate tune": "steps=20000 --trials 2 --episodes 20",
@@ -76,10 +76,11 @@ SMALL = {  # options that make a command small
     "README.md: tailgate leaderboard run": "--defence kf",
     "docs/guide.md: tailgate leaderboard run quick-v0 --out boards --train": "--defence chi2_kf",
     "tailgate leaderboard check": "--sample 5",
-    "tailgate leaderboard detect": "--episodes 5 --onsets 5 --hours 0.1",
+    "docs/scoring.md: tailgate leaderboard check": "--sample 1",
     "tailgate leaderboard verify": "--sample 20",
     "pip install --no-deps .": "--no-build-isolation --target .",
     "python train.py": "steps=400000 episodes=20",
+    "python train.py --config": "steps=20000 episodes=10 seeds=2",
     "python results/ch4-v0/ch4.py": "--seeds 2",
 }
 
