@@ -1,7 +1,6 @@
 """Python examples of pages that no other test plays: each page's blocks run one after the other, as a reader types them."""
 
 import os
-import re
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -10,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import tailgate
+from tests.pages import ROOT, blocks
 
-ROOT = Path(__file__).parents[1]
 PAGES = {  # the packages that a page needs
     "README.md": (), "docs/automata.md": (), "docs/engine.md": (), "docs/guide.md": ("matplotlib", "pandas"), "docs/highway.md": ("highway_env",),
     "docs/lane-keeping.md": (), "docs/rendering.md": ("pygame", "highway_env"), "docs/submissions.md": (), "docs/two-players.md": (),
@@ -32,22 +31,18 @@ CHANGED = {  # what cannot be had everywhere
 }
 
 
-def blocks(page: str) -> list[str]:
-    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL)
-
-
 @pytest.mark.thin(8)
 @pytest.mark.parametrize("page", PAGES)
 def test_the_blocks_of_a_page_run(page: str, tmp_path: Path) -> None:
     for needed in PAGES[page]:
         pytest.importorskip(needed)
-    code = "\n".join(blocks(page))
+    code = "\n".join(blocks(page, "python"))
     if page in CHANGED:
         old, new = CHANGED[page]
         assert old in code
         code = code if new is None else code.replace(old, new)
     (tmp_path / "results").symlink_to(ROOT / "results")
-    (tmp_path / "mydefence.py").write_text(blocks("docs/new-defence.md")[0], encoding="utf-8")
+    (tmp_path / "mydefence.py").write_text(blocks("docs/new-defence.md", "python")[0], encoding="utf-8")
     tailgate.evaluate(scenarios="stop-and-go-v0", defences="kf", attacks="none", seeds=1, out=tmp_path / "rows.jsonl")
     (tmp_path / "page.py").write_text(code, encoding="utf-8")
     quiet = os.environ | {"SDL_VIDEODRIVER": "dummy"}  # windows without a screen
@@ -59,6 +54,6 @@ def test_the_blocks_of_a_page_run(page: str, tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_the_script_of_docs_distributed_prints_its_table(tmp_path: Path) -> None:
-    (tmp_path / "table.py").write_text(blocks("docs/distributed.md")[0], encoding="utf-8")
+    (tmp_path / "table.py").write_text(blocks("docs/distributed.md", "python")[0], encoding="utf-8")
     done = subprocess.run([sys.executable, "table.py", "1", "thesis-ch5-v0"], cwd=tmp_path, capture_output=True, text=True, timeout=600, check=True)
     assert len(done.stdout.splitlines()) == 16 and all(line.count("|") == 7 for line in done.stdout.splitlines())

@@ -2,29 +2,21 @@
 
 import re
 import shlex
-from pathlib import Path
 
 import pytest
 
 from tailgate.cli.command_line import _parser
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import list_scenarios, list_suites
+from tests.pages import PAGES, commands
 
-ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *(p for p in sorted((ROOT / "docs").rglob("*.md")) if not {"generated", "extension"} & set(p.relative_to(ROOT).parts))]
 OWN = re.compile(r"my\w*:|\.ya?ml|\.json|path=|\$|^bwrap/|[A-Z]|^all$")  # a reader's, or a word that stands for one
 
 
 def _commands() -> list[tuple[str, str]]:
     """Return page and words of each command; without those that other commands write a part of."""
-    out = []
-    for page in PAGES:
-        for block in re.findall(r"```console\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
-            for line in block.replace("\\\n", " ").splitlines():
-                for part in re.split(r" && |; done", line.strip().removeprefix("do ").removeprefix(".venv/bin/")):
-                    if part.startswith("tailgate ") and "..." not in part and "$(" not in part:
-                        out.append((page.name, part.removeprefix("tailgate ")))
-    return out
+    parts = [(page, part.removeprefix("do ")) for page in PAGES for line in commands(page) for part in line.split("; ")]
+    return [(page, part.removeprefix("tailgate ")) for page, part in parts if part.startswith("tailgate ") and "..." not in part and "$(" not in part]
 
 
 def test_there_are_many() -> None:
