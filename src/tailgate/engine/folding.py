@@ -1,4 +1,4 @@
-"""What a graph knows without computing it: operations that change nothing, and choices among constants."""
+"""Operations that change nothing, and choices among constants: found while a graph is made."""
 
 from __future__ import annotations
 

@@ -120,7 +120,7 @@ def rear_collided(trace: Trace) -> Array:
 
 @metric("0/1")
 def crashed(trace: Trace) -> Array:
-    """Either collision: the damage that the safety board counts."""
+    """Either collision; boards of -v1 count lost progress as damage too."""
     return np.maximum(collided(trace), rear_collided(trace))
 
 
