@@ -38,6 +38,7 @@ EXCEPTED = {
     "tailgate zoo add": "writes into the package; tests/test_zoo.py adds to another folder",
     "for d in": "attackers of a published board, hours",
     "tailgate leaderboard run car-following-v1": "a published board, hours",
+    "tailgate leaderboard run lane-v0": "a published board, hours",
     "tailgate leaderboard run quick-v1": "a published board, an hour",
     "tailgate leaderboard run radar-v": "a published board, hours",
     "docs/results/quick-v0.md: tailgate leaderboard": "a published board, with the attackers that the loops make",
