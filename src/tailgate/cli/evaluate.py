@@ -31,7 +31,7 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     add_options(command, "--suite", "--defence", "--attack")
     command.add_argument("--scenario", action="append", metavar="NAME",
-                         help="a scenario (repeatable); with --suite: at its doses, and with what the suite grants in place of the scenario")  # fmt: skip
+                         help="a scenario (repeatable); with --suite: at its doses and with what it grants")  # fmt: skip
     add_options(command, "--dose", "--threat")
     command.add_argument("--seeds", type=int, metavar="N", help="episodes per cell instead of the suite's")
     command.add_argument("--metric", action="append", metavar="NAME",
