@@ -52,7 +52,7 @@ def test_an_attack_is_in_the_program():
 
 def test_other_numbers_of_a_strangers_classes_are_not_traced_again(monkeypatch):
     rollout_of(_loop(), Nudge())
-    monkeypatch.setattr("tailgate.engine.program.traced", lambda *_: pytest.fail("traced again"))
+    monkeypatch.setattr("tailgate.engine.tracing.traced", lambda *_: pytest.fail("traced again"))
     monkeypatch.setattr("tailgate.play.rollouts.traced", lambda *_: pytest.fail("traced again"))
     loop, keys = _loop(stubborn(eta=5.0), plant=Pendulum(pull=0.5), sensor=Gyroscope((0.02, 0.03))), draws.keys("report", range(5))
     program = rollout_of(loop, Nudge(gain=0.9))
