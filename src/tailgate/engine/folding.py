@@ -18,7 +18,7 @@ def is_choice(node: Node) -> bool:
     while left:
         one = left.pop()
         seen += 1
-        if (one.op not in ("select", "const")) or one.dtype.kind not in "iu" or seen > CHOSEN:
+        if one.op not in ("select", "const") or one.dtype.kind not in "iu" or seen > CHOSEN:
             return False
         left.extend(one.args[1:])
     return seen > 1

@@ -6,13 +6,13 @@ Each operation gives the bits that numpy gives. Comparisons, roundings and conve
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Container, Sequence
 from typing import Any
 
 import numpy as np
 
 from tailgate.engine.evaluation import Evaluation, multiplied
-from tailgate.engine.graph import Graph, Node, computed
+from tailgate.engine.graph import Graph, Node, computed, ordered
 from tailgate.engine.operations import COMPARISONS, FLOAT, Array
 from tailgate.engine.program import Program
 from tailgate.engine.tracing import Trace
@@ -219,15 +219,16 @@ class TorchForm:
         trace : of a function that maps a state and arguments to the next state and results
         results : names of results, one number of an episode each
         """
-        following = {now.id: (now.attr, new) for name in trace.state for now, new in trace.pairs(name)}
-        asked = {name: trace.results[name].item() for name in results}
-        needed = _needed(asked.values(), following)
-        moving = _moving(needed, [node for nodes in trace.arguments.values() for node in nodes.flat], following)
+        trace = trace.pruned({name: trace.results[name] for name in results})
+        asked = {name: nodes.item() for name, nodes in trace.results.items()}
+        pairs = [pair for name in trace.state for pair in trace.pairs(name)]
+        nodes = ordered([*asked.values(), *(new for _, new in pairs)])
+        moving = _moving(nodes, [node for held in trace.arguments.values() for node in held.flat], pairs)
         self._arguments, self._large = trace.arguments, {now.attr for now, _ in trace.large.values()}
-        self._state = {name: new for i, (name, new) in following.items() if i in moving}
+        self._state = {now.attr: new for now, new in pairs if now.id in moving}
         self._results = {name: node for name, node in asked.items() if node.id in moving}
         self._evaluation = TorchEvaluation(trace.graph, [*self._results.values(), *self._state.values()], moving)
-        given = {a.id: a for node in needed if node.id in moving for a in node.args if not a.fixed and a.id not in moving}
+        given = {a.id: a for node in nodes if node.id in moving for a in node.args if not a.fixed and a.id not in moving}
         self._given: dict[str, list[Node]] = {}  # what machine code hands over, by type
         for node in given.values():
             self._given.setdefault(f"given {node.dtype}", []).append(node)
@@ -282,22 +283,11 @@ def _program(trace: Trace, results: dict[str, Node], given: dict[str, list[Node]
     return Program(trace.pruned(wanted))
 
 
-def _needed(asked: Iterable[Node], following: dict[int, tuple[Any, Node]]) -> list[Node]:
-    """Return what the asked nodes need, now or in a later step, arguments first."""
-    left, seen = list(asked), {}
-    while left:
-        node = left.pop()
-        if node.id in seen:
-            continue
-        seen[node.id] = node
-        left.extend(node.args)
-        if node.id in following:
-            left.append(following[node.id][1])
-    return [seen[i] for i in sorted(seen)]
+def _moving(nodes: Sequence[Node], arguments: Sequence[Node], pairs: Sequence[tuple[Node, Node]]) -> set[int]:
+    """Return the numbers of the nodes that the arguments reach on a way with derivatives, in this step or in a later one.
 
-
-def _moving(nodes: Sequence[Node], arguments: Sequence[Node], following: dict[int, tuple[Any, Node]]) -> set[int]:
-    """Return the numbers of the nodes that the arguments reach, now or in a later step, on a way with derivatives."""
+    pairs: the nodes of the state, now and next.
+    """
     moving, before = {node.id for node in arguments}, -1
     while len(moving) > before:
         before = len(moving)
@@ -305,5 +295,5 @@ def _moving(nodes: Sequence[Node], arguments: Sequence[Node], following: dict[in
             through = node.op in ("call", "loop") or (node.dtype == FLOAT and node.op not in _FLAT)
             if through and any(a.id in moving for a in node.args):
                 moving.add(node.id)
-        moving |= {i for i, (_, new) in following.items() if new.id in moving}
+        moving |= {now.id for now, new in pairs if new.id in moving}
     return moving
