@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from rich.console import Console
+from rich.progress import Progress as Bars
 
 from tailgate.base import progress
 from tailgate.ensemble import standard
@@ -38,6 +39,17 @@ def test_a_label_that_is_used_again_begins_again() -> None:
         for done in (0, 6, 0, 3, 3, 6):
             update("searches", done, 6, f"{done} of 6")
     assert out.getvalue().splitlines() == ["searches: 100 % 6 of 6", "searches: 50 % 3 of 6", "searches: 100 % 6 of 6"]
+
+
+def test_a_terminal_keeps_the_last_bars(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bars that are not finished stay too."""
+    held: list[Any] = []
+    monkeypatch.setattr(progress, "Progress", lambda *columns, console: held.append(Bars(*columns, console=console)) or held[0])
+    with progress.progress(Console(file=io.StringIO(), force_terminal=True)) as update:
+        for number in range(30):
+            update(f"defence {number}", 3 if number == 5 else 6, 6, "")
+    shown = [task.description for task in held[0].tasks if task.visible]
+    assert shown == ["defence 5", *(f"defence {number}" for number in range(21, 30))]
 
 
 def test_searches_in_other_processes_are_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

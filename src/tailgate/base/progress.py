@@ -9,6 +9,7 @@ from contextvars import ContextVar
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+KEPT = 8  # finished bars that stay on a terminal
 Update = Callable[[str, int, int, str], None]  # label, done, total, figures
 _silent: ContextVar[bool] = ContextVar("silent", default=False)
 
@@ -60,6 +61,8 @@ def progress(shown_on: Console) -> Iterator[Update]:
 
         def bar(label: str, done: int, total: int, figures: str = "") -> None:
             if label not in tasks:
+                for old in bars.tasks[:-KEPT]:  # a terminal has no room for the bars of a whole board
+                    bars.update(old.id, visible=not old.finished)
                 tasks[label] = bars.add_task(label, total=total, figures="")
             bars.update(tasks[label], completed=done, total=total, figures=figures)  # type: ignore[arg-type]
 
