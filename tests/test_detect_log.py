@@ -166,7 +166,10 @@ def test_a_recording_without_a_name_has_that_of_its_file(tmp_path, capsys):
     units = [f"{text}:{'m' if text == 'gap=gap' else 'm/s'}" if "=" in text and text != "t=t" else text for text in columns]
     assert main(["detect-log", str(path), "--defence", "kf", *units, "--json"]) == 0
     said = capsys.readouterr()
-    assert json.loads(said.out)[0]["recording"] == "drive.csv" and "no unit" not in said.err
+    assert json.loads(said.out)[0]["recording"] == "drive.csv" and "no unit" not in said.err and "typical" not in said.err
+    path.write_text(path.read_text().replace(",20.0,", ",72.0,"))  # km/h, next to a relative speed in m/s
+    assert main(["detect-log", str(path), "--defence", "kf", *units]) == 0
+    assert "drive.csv: a typical own speed of 72 m/s is 259 km/h" in " ".join(capsys.readouterr().err.split())
     assert without_unit(["gap=gap:m", "speed=v:raw"]) == ["speed=v:raw"]
 
 

@@ -99,6 +99,14 @@ def test_pictures_are_vectors_and_repeat(form: str, start: bytes, tmp_path: Path
     assert (tmp_path / "a").read_bytes().startswith(start)
 
 
+def test_a_picture_says_who_has_no_rank() -> None:
+    pytest.importorskip("matplotlib")
+    held, text = load(FILE), exported(load(FILE), "svg").decode()
+    assert {bool(entry["rank"]) for entry in held["entries"]} == {True, False}
+    for entry in held["entries"]:
+        assert (f"<!-- {entry['defence']} (no rank) -->" in text) == (not entry["rank"])
+
+
 def test_another_form_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["leaderboard", "export", str(FILE), "--format", "docx"]) == 2
     error = capsys.readouterr().err

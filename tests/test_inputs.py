@@ -135,7 +135,8 @@ def test_numbers_of_a_threat_model_have_limits(field, value):
 
 
 @pytest.mark.parametrize(("family", "name", "params", "said"), [
-    ("plant", "car_following", {"gap": -3}, r"plant car_following\.gap: got -3; expected greater than 0"),
+    ("plant", "car_following", {"gap": -3}, r"plant car_following\.gap: got -3; expected greater than 0 \[m\]"),
+    ("plant", "car_following", {"initial_sd": [0, -2.0, 0]}, r"initial_sd\.1: got -2\.0; expected greater than or equal to 0 \[m/s\]"),
     ("plant", "car_following", {"initial_sd": [20.0, 0, 0]}, r"car_following\.gap: got 85\.5; expected more than 6 times"),
     ("plant", "car_following", {"rear_reaction": 5000.0}, r"rear_reaction: got 5000\.0; expected at most 10000 steps"),
     ("plant", "platoon", {"gap": 2.0}, r"plant platoon\.gap: got 2\.0; expected more than gap_range"),

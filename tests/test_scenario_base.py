@@ -121,5 +121,5 @@ def test_what_is_no_scenario_is_one_clear_error(value: object) -> None:
 
 
 def test_a_headway_in_milliseconds_is_refused() -> None:
-    with pytest.raises(InputError, match=r"controller acc.headway: got 1500.0; expected less than or equal to 60"):
+    with pytest.raises(InputError, match=r"controller acc.headway: got 1500.0; expected less than or equal to 60 \[s\]"):
         load_scenario({"base": "stop-and-go-v0", "controller": {"headway": 1500.0}})

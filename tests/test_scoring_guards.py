@@ -53,6 +53,8 @@ def test_rows_of_another_threat_model_are_refused() -> None:
     rows = evaluate(SMALL)
     assert score(rows, SMALL, require_adaptive=False)["suite"]["rows"] == len(rows)
     weaker = evaluate(SMALL, threat={"fdi_bound": 4.0})
+    assert {row["suite"] for row in weaker} == {"custom"} and {row["suite"] for row in evaluate(SMALL, threat={})} == {SMALL.name}
+    weaker = [row | {"suite": SMALL.name} for row in weaker]
     with pytest.raises(InputError, match=r"config_hash.*own threat model"):
         score(weaker, SMALL)
 

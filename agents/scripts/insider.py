@@ -21,8 +21,8 @@ from tailgate.core.threat import Brief, fit
 class Insider(Script):
     """A car scales the two gains of its law, on the spacing error and its rate, and ignores its defence."""
 
-    kp_scale: Finite = param(0.0, "factor on the gain of the spacing error, cut at gain_bound [-]")
-    kd_scale: Finite = param(-1.0, "factor on the gain of the error's rate, cut at gain_bound [-]")
+    kp_scale: Finite = param(0.0, "factor on the gain of the spacing error, cut at gain_bound [-]", cut="gain_bound")
+    kd_scale: Finite = param(-1.0, "factor on the gain of the error's rate, cut at gain_bound [-]", cut="gain_bound")
 
     def prepare(self, brief: Brief) -> ScriptPlan:
         attack, geared = "attack insider", brief.geared

@@ -59,7 +59,7 @@ def _aimed(script: Script, brief: Brief, kind: str) -> ScriptPlan:
 class NoiseJam(OverTheAir):
     """A jammer's noise reaches the receiver, which measures worse, or nothing, as their powers decide."""
 
-    power: Positive = param(0.1, "power of the jammer, cut at jam_power [W]")
+    power: Positive = param(0.1, "power of the jammer, cut at jam_power [W]", cut="jam_power")
 
     def prepare(self, brief: Brief) -> ScriptPlan:
         return _aimed(self, brief, "noise_jam")
@@ -73,7 +73,7 @@ class NoiseJam(OverTheAir):
 class EchoDelay(OverTheAir):
     """The probe is answered late: the car ahead seems to be farther away than it is."""
 
-    delay: Positive = param(6.0, "extra range, cut at delay_bound [m]")
+    delay: Positive = param(6.0, "extra range, cut at delay_bound [m]", cut="delay_bound")
 
     def prepare(self, brief: Brief) -> ScriptPlan:
         return _aimed(self, brief, "echo_delay")

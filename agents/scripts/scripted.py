@@ -131,8 +131,8 @@ def wires_hit(plan: ScriptPlan, probability: float | Array, draws: Draws) -> Arr
 class Jam(Script):
     """Denial of service: the receiver reads uniform random values of the jammer."""
 
-    low: Finite = param(-108.0, "smallest value [unit of the wire]")
-    high: Finite = param(108.0, "largest value [unit of the wire]")
+    low: Finite = param(-108.0, "smallest value [unit of the wire]", cut="jam_range")
+    high: Finite = param(108.0, "largest value [unit of the wire]", cut="jam_range")
 
     def __post_init__(self) -> None:
         if self.low > self.high:
@@ -172,7 +172,7 @@ class Dropout(Script):
 class Inject(Script):
     """False data injection: a constant bias, cut at the bound of the threat model."""
 
-    value: Finite = param(-20.0, "bias [unit of the wire]")
+    value: Finite = param(-20.0, "bias [unit of the wire]", cut="fdi_bound")
     signs: Count | None = param(None, "seed of a random sign for each wire of each agent; none: the bias has one sign everywhere")
 
     def prepare(self, brief: Brief) -> ScriptPlan:
@@ -204,7 +204,7 @@ class InjectBernoulli(Script):
     """False data injection: at each step and on each wire with a probability, a constant bias."""
 
     probability: Probability = param(0.5, "probability of a hit per step and wire [-]")
-    value: Finite = param(-20.0, "bias [unit of the wire]")
+    value: Finite = param(-20.0, "bias [unit of the wire]", cut="fdi_bound")
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
         return inject(plan, on, Constant(self.value), count, draws, hit=wires_hit(plan, self.probability, draws))
@@ -228,7 +228,7 @@ class InjectRamp(Script):
 class InjectThenJam(Script):
     """A constant bias first, then jamming: what the gate has let in is kept in, as it now shuts out the honest samples."""
 
-    value: Finite = param(-3.0, "bias, and the jammer's value [unit of the wire]")
+    value: Finite = param(-3.0, "bias, and the jammer's value [unit of the wire]", cut="fdi_bound")
     inject: PositiveCount = param(15, "steps of the bias before the jamming")
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
@@ -243,8 +243,8 @@ class InjectThenJam(Script):
 class InjectUniform(Script):
     """False data injection: uniform random values, cut at the bound of the threat model."""
 
-    low: Finite = param(-10.0, "smallest value [unit of the wire]")
-    high: Finite = param(10.0, "largest value [unit of the wire]")
+    low: Finite = param(-10.0, "smallest value [unit of the wire]", cut="fdi_bound")
+    high: Finite = param(10.0, "largest value [unit of the wire]", cut="fdi_bound")
 
     def __post_init__(self) -> None:
         if self.low > self.high:
@@ -299,7 +299,7 @@ class InjectSparse(Script):
 class InjectActuator(Script):
     """False data injection into the command on its way to the actuator: a constant bias, of which the defence is not told."""
 
-    value: Finite = param(1.0, "bias, cut at actuator_bound [unit of the actuator]")
+    value: Finite = param(1.0, "bias, cut at actuator_bound [unit of the actuator]", cut="actuator_bound")
 
     def prepare(self, brief: Brief) -> ScriptPlan:
         if not brief.model.actuators:

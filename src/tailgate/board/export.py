@@ -176,7 +176,8 @@ def _over_doses(entries: Sequence[Entry], curves: Mapping[str, Curve]) -> Figure
         points = [point for point in curves[entry.defence].points if point.dose is not None]
         x, y = [point.dose for point in points], [100.0 * point.value for point in points]
         if i < DRAWN:
-            axes.errorbar(x, y, _limits(points), marker=MARKERS[i], capsize=2, label=entry.defence)
+            face = None if entry.rank else "white"
+            axes.errorbar(x, y, _limits(points), marker=MARKERS[i], markerfacecolor=face, capsize=2, label=_label(entry))
         else:
             axes.plot(x, y, color="0.75", linewidth=0.8, zorder=0, label="others" if i == DRAWN else None)
     axes.set(xlabel="dose [attacked steps]", ylabel="damaged episodes [%]", ylim=(-2, 102))
@@ -189,11 +190,19 @@ def _at_one_dose(entries: Sequence[Entry], curves: Mapping[str, Curve]) -> Figur
     """Draw a mark with limits for each defence, in the order of the page; a line would join what was not played."""
     figure, ((axes,),) = canvas(6.4, 1.2 + 0.22 * max(len(entries), 1))
     last = [next(point for point in reversed(curves[entry.defence].points) if point.dose is not None) for entry in entries]
-    axes.errorbar([100.0 * point.value for point in last], range(len(last)), xerr=_limits(last), fmt="o", color="black", capsize=2)
-    axes.set_yticks(range(len(last)), [entry.defence for entry in entries], fontsize=8)
+    x, limits = np.array([100.0 * point.value for point in last]), _limits(last)
+    for ranked in (True, False):
+        at = [i for i, entry in enumerate(entries) if bool(entry.rank) == ranked]
+        face = "black" if ranked else "white"
+        axes.errorbar(x[at], at, xerr=limits[:, at], fmt="o", color="black", markerfacecolor=face, capsize=2)
+    axes.set_yticks(range(len(last)), [_label(entry) for entry in entries], fontsize=8)
     axes.invert_yaxis()
     axes.set(xlabel=f"damaged episodes at {last[0].dose} attacked steps [%]" if last else "", xlim=(-2, 102))
     return figure
+
+
+def _label(entry: Entry) -> str:
+    return entry.defence if entry.rank else f"{entry.defence} (no rank)"
 
 
 def _limits(points: Sequence[Point]) -> Array:

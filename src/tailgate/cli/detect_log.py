@@ -46,6 +46,7 @@ def _detect(options: argparse.Namespace) -> int:
     from tailgate.base.files import write_atomic
     from tailgate.roads.detect_log import Settings, detect, draw, write_parquet
     from tailgate.roads.readers import Choice, mapping_of, read, without_unit
+    from tailgate.roads.recording import HURRIED
     from tailgate.roads.replayed import Noise
 
     own_classes()
@@ -58,6 +59,9 @@ def _detect(options: argparse.Namespace) -> int:
     recordings = read(options.file, options.format, choice)
     if bare := without_unit(options.map):
         tell(f"no unit is named in {', '.join(bare)}: m or m/s is taken. A unit follows a colon, as in gap=dist:ft")
+    for found in recordings:
+        if (speed := found.typical_speed) > HURRIED:
+            tell(f"{found.name}: a typical own speed of {speed:.0f} m/s is {3.6 * speed:.0f} km/h; is the unit m/s?")
     noise = Noise(options.range_sd, options.speed_sd)
     settings = Settings(noise, options.window, options.dose, tuple(threat_of(options).items()), options.hours)
     with working() as update:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from tailgate.base.files import aside, writable_directory
 from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, tell, threat_of, working
-from tailgate.core.schema import scalar
+from tailgate.core.schema import canonical, scalar
 
 if TYPE_CHECKING:
     from tailgate.core.scenario import Suite
@@ -86,12 +86,28 @@ def _evaluate(options: argparse.Namespace) -> int:
     attacked = [row for row in rows if row["attack"] != "none" and row["status"] == "ok"]
     if attacked and not any(row["attack_steps"] for row in attacked):
         tell("no attack took place in any episode: --attack names others, --threat grants more")
-    for warning in _dependent(rows):
+    for warning in (*_above(rows, options.attack or ()), *_dependent(rows)):
         tell(f"warning: {warning}")
     idle = bool(rows) and all(entry["crash"] is None for entry in table)
     if idle and not failed:
         tell(f"nothing was played: {table[0]['reason']}")
     return 1 if failed or idle else 0
+
+
+def _above(rows: list[dict[str, Any]], named: Sequence[str]) -> list[str]:
+    """Return warnings on values of these attacks that the threat models of their rows cut."""
+    from tailgate.core.registry import Spec
+
+    out = []
+    for attack in named:
+        granted = {canonical(row["threat_model"]): row["threat_model"] for row in rows if row["attack"] == attack and row["status"] == "ok"}
+        made = Spec("attack", attack).make() if granted else None
+        for field in getattr(made, "__dataclass_fields__", {}).values():
+            bounds = [threat[field.metadata["cut"]] for threat in granted.values() if field.metadata.get("cut")]
+            for bound in sorted({tuple(bound) if isinstance(bound, list) else (-bound, bound) for bound in bounds if bound is not None}):
+                if not bound[0] <= getattr(made, field.name) <= bound[1]:
+                    out.append(f"{attack}: {field.name} is cut at {field.metadata['cut']}, {bound[0]:g} to {bound[1]:g}")
+    return out
 
 
 def _dependent(rows: list[dict[str, Any]]) -> list[str]:

@@ -36,9 +36,12 @@ P = TypeVar("P", default=Any)  # type of a component's plan
 S = TypeVar("S", default=Any)  # type of its state
 
 
-def param(default: object, doc: str, if_any: bool = False) -> Any:
-    """Return a dataclass field with its default, unit and one sentence; with `if_any` its data is written only where it is not empty."""
-    return dataclasses.field(default=default, metadata={"doc": doc, "if_any": if_any})
+def param(default: object, doc: str, if_any: bool = False, cut: str = "") -> Any:
+    """Return a dataclass field with its default, unit and one sentence; with `if_any` its data is written only where it is not empty.
+
+    `cut` names the bound of the threat model at which a script cuts this value.
+    """
+    return dataclasses.field(default=default, metadata={"doc": doc, "if_any": if_any, "cut": cut})
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,6 +46,7 @@ PUBLISHED = {
     "tailgate.estimators.distributed.distributed_kalman": "tailgate.estimators.distributed",
     "tailgate.estimators.mitigations.responses": "tailgate.estimators.mitigations",
 }
+UNIT = re.compile(r"\[([^][]+)\]$")  # how the sentence on a parameter ends
 COMPONENTS = re.compile(r"(tailgate\.(?:envs|estimators|agents))\.\w+\.(\w+)")  # hashes leave out which sub-folder a module lies in
 
 
@@ -91,7 +92,17 @@ def build(cls: type[T], data: dict[str, Any], where: str) -> T:
         if isinstance(inner := first.get("ctx", {}).get("error"), InputError):
             raise inner from None
         path = ".".join(str(part) for part in first["loc"]) or cls.__name__
-        raise InputError(f"{where}.{path}", first["input"], wanted(first)) from None
+        unit = _unit(known, first["loc"]) if first["type"].startswith(("greater", "less")) else ""
+        raise InputError(f"{where}.{path}", first["input"], f"{wanted(first)}{unit}") from None
+
+
+def _unit(known: dict[str, Any], place: tuple[int | str, ...]) -> str:
+    """Return the unit at the end of a parameter's sentence, with a space before it."""
+    found = UNIT.search(known[place[0]].metadata.get("doc", "")) if place and place[0] in known else None
+    units = found[1].split(", ") if found else [""]
+    at = place[1] if len(units) > 1 and len(place) > 1 else 0
+    unit = units[at] if isinstance(at, int) and at < len(units) else ""
+    return "" if unit in ("", "-") else f" [{unit}]"
 
 
 def _made(cls: type[T], data: dict[str, Any], where: str) -> T:

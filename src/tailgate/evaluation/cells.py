@@ -341,7 +341,7 @@ def evaluate(
     defences, attacks : names or objects, one or a list
     scenarios : one or a list: names, YAML files, mappings of fields, or objects
     doses : one or a list; with scenarios and seeds, they replace those of the suite
-    threat : changes of the scenarios' threat models
+    threat : changes of the scenarios' threat models; rows then belong to the suite `custom`
     beacon : the round that the episodes belong to
     batch, workers : episodes played together, and processes; they change no bit
     out : file for the rows
@@ -361,6 +361,8 @@ def evaluate(
             )  # fmt: skip
     base = load_suite(suite) if isinstance(suite, str) else suite if suite is not None else Suite(name="custom")
     defences, attacks = _several(base.defences if defences is None else defences), _several(base.attacks if attacks is None else attacks)
+    if threat and base.granted | threat != base.granted and not beacon:  # no longer what the suite is about; a beacon's seeds need the name
+        base = dataclasses.replace(base, name="custom")
     sizes.check("batch", batch)
     sizes.check("workers", workers)
     sizes.check("seeds", base.seeds if seeds is None else seeds)

@@ -13,6 +13,7 @@ from tailgate.core import Array
 LEAST = 5.0  # shortest segment that is kept [s]
 RATE = (0.005, 2.0)  # admitted distance of samples [s]
 FASTEST = 100.0  # admitted speed [m/s]
+HURRIED = 60.0  # typical speed that is more likely in another unit [m/s]
 FARTHEST = 1000.0  # admitted gap [m]
 MISSING = 0.5  # largest share of missing readings
 REPEATED = 0.01  # largest share of repeated times
@@ -53,6 +54,11 @@ class Recording:
     @property
     def samples(self) -> int:
         return sum(len(part.gap) for part in self.segments)
+
+    @property
+    def typical_speed(self) -> float:
+        """The median of the own speed [m/s]."""
+        return float(np.median(np.concatenate([part.speed for part in self.segments])))
 
     @property
     def hours(self) -> float:
