@@ -63,7 +63,7 @@ def test_jitter_is_interpolated_and_short_segments_are_dropped():
 
 
 def test_a_mapping_is_checked():
-    assert mapping_of(["speed=v:km/h", "gap=d"]) == (("speed", "v", "km/h"), ("gap", "d", "m"))
+    assert mapping_of(["speed=v:km/h", "gap=d"]) == (("speed", "v", "km/h"), ("gap", "d", ""))
     for text, words in (("speed", "WHAT=COLUMN"), ("velocity=v", "--map: got 'velocity'"), ("gap=", "WHAT=COLUMN")):
         with pytest.raises(InputError, match=words):
             mapping_of([text])

@@ -45,7 +45,7 @@ def add(commands: Commands) -> None:
 def _detect(options: argparse.Namespace) -> int:
     from tailgate.base.files import write_atomic
     from tailgate.roads.detect_log import Settings, detect, draw, write_parquet
-    from tailgate.roads.readers import Choice, mapping_of, read, without_unit
+    from tailgate.roads.readers import Choice, mapping_of, read
     from tailgate.roads.recording import HURRIED
     from tailgate.roads.replayed import Noise
 
@@ -57,7 +57,7 @@ def _detect(options: argparse.Namespace) -> int:
     plot = picture("--plot", options.plot) if options.plot else None
     choice = Choice(options.vehicle, options.lead, options.length, mapping_of(options.map))
     recordings = read(options.file, options.format, choice)
-    if bare := without_unit(options.map):
+    if bare := [f"{what}={column}" for what, column, unit in choice.mapping if not unit and what != "t"]:
         tell(f"no unit is named in {', '.join(bare)}: m or m/s is taken. A unit follows a colon, as in gap=dist:ft")
     for found in recordings:
         if (speed := found.typical_speed) > HURRIED:

@@ -44,16 +44,11 @@ class Choice:
     vehicle: str | None = None
     lead: str | None = None
     length: float = LENGTH
-    mapping: tuple[tuple[str, str, str], ...] = ()  # what, column, unit
-
-
-def without_unit(texts: Sequence[str]) -> list[str]:
-    """Return the texts, such as `speed=v_ego`, that name no unit of a length or speed. Another unit of time is refused anyway."""
-    return [text for text in texts if text.rpartition(":")[2] not in UNITS and not text.startswith("t=")]
+    mapping: tuple[tuple[str, str, str], ...] = ()  # what, column, unit; no unit: s, m or m/s
 
 
 def mapping_of(texts: Sequence[str]) -> tuple[tuple[str, str, str], ...]:
-    """Return what, column and unit of texts such as `speed=v_ego:km/h`. Raise InputError for anything else."""
+    """Return what, column and unit, empty where none is named, of texts such as `speed=v_ego:km/h`. Raise InputError for anything else."""
     out = []
     for text in texts:
         what, sep, rest = text.partition("=")
@@ -62,7 +57,7 @@ def mapping_of(texts: Sequence[str]) -> tuple[tuple[str, str, str], ...]:
             raise InputError("--map", text, "WHAT=COLUMN or WHAT=COLUMN:UNIT, such as speed=v_ego:km/h")
         if what not in WANTED:
             raise unknown("--map", what, WANTED)
-        out.append((what, column, unit or ("s" if what == "t" else "m" if what == "gap" else "m/s")))
+        out.append((what, column, unit))
     return tuple(out)
 
 
@@ -203,7 +198,7 @@ def _ultra_av(table: Table, choice: Choice) -> list[Raw]:
 
 
 def _mapped(table: Table, choice: Choice) -> list[Raw]:
-    held = {what: UNITS[unit] * table.numbers(column) for what, column, unit in choice.mapping}
+    held = {what: UNITS.get(unit, 1.0) * table.numbers(column) for what, column, unit in choice.mapping}
     for what in ("t", "gap", "speed"):
         if what not in held:
             raise InputError("--map", sorted(held), f"{what}=COLUMN too")
