@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo docs wheels test test-long nightly lint bench crash fuzz clean
+.PHONY: demo docs wheels test test-long test-rllib nightly lint bench crash fuzz clean
 
 demo: $(VENV)/.ready  ## train an adversary against a gated Kalman filter, compare it with scripted attacks, write the page
 	$(BIN)/python train.py
@@ -20,6 +20,10 @@ test: $(VENV)/.ready lint  ## lint, types, tests; a thread in each of two proces
 
 test-long: $(VENV)/.docs lint  ## and the tests that take a minute each, as before a release
 	$(BIN)/python -m pytest -n 2 --dist worksteal --long
+
+test-rllib: .venv-rllib/.ready  ## tests of the environments with the versions that RLlib pins, gymnasium 1.2.2 among them
+	.venv-rllib/bin/python -m pytest -n 2 tests/test_faces.py tests/test_face_laws.py tests/test_face_peers.py tests/test_specs.py \
+	  tests/test_render.py tests/test_teaching.py tests/test_highway.py
 
 nightly: test-long fuzz crash  ## everything: the long tests and both campaigns, five hours or so
 
@@ -51,9 +55,16 @@ $(VENV)/.ready: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[all,dev]'
 	touch $@
 
+.venv-rllib/.ready: pyproject.toml constraints-rllib.txt
+	$(PYTHON) -m venv .venv-rllib
+	.venv-rllib/bin/python -m pip install --quiet --constraint constraints-rllib.txt torch
+	.venv-rllib/bin/python -m pip install --quiet --constraint constraints-rllib.txt '.[train,game,highway,viz,pandas]' 'ray[rllib]' \
+	  pytest pytest-xdist hypothesis
+	touch $@
+
 $(VENV)/.docs: $(VENV)/.ready
 	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[docs]'
 	touch $@
 
 clean:
-	rm -rf $(VENV) build dist site docs/generated *.egg-info
+	rm -rf $(VENV) .venv-rllib build dist site docs/generated *.egg-info

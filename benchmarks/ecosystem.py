@@ -119,12 +119,14 @@ def tried(name: str, scratch: Path) -> dict[str, Any]:
 
 def table(record: list[dict[str, Any]]) -> str:
     """Return the page's table."""
-    lines = ["| library | tried with | Python | extra | runs | seconds | its last line |", "|---|---|---|---|---|---|---|"]
+    heads = ("library", "pip install", "tried with", "Python", "extra", "runs", "seconds", "its last line")
+    lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
     for entry in record:
         named = ", ".join(f"{name} {version}" for name, version in entry["versions"].items())
         said = (entry["printed"] if entry["passed"] else entry["error"]).replace("|", "\\|")
+        install = " ".join(f"'{part}'" if set(part) & set("[>") else part for part in entry["install"])
         facts = ("yes" if entry["extra"] else "no", "yes" if entry["passed"] else "no", f"{entry['seconds']:.0f}")
-        lines.append(f"| {entry['library']} | {named or '-'} | {entry['python'] or '-'} | {' | '.join(facts)} | {said} |")
+        lines.append(f"| {entry['library']} | `{install}` | {named or '-'} | {entry['python'] or '-'} | {' | '.join(facts)} | {said} |")
     return "\n".join(lines)
 
 
@@ -147,6 +149,8 @@ def main() -> None:
                 record = [known[library] for library in LIBRARIES if library in known]
                 write_atomic(asked.out, (json.dumps(record, indent=1) + "\n").encode())
     print(table([known[library] for library in LIBRARIES if library in known]))
+    if failed := [] if asked.table else [name for name in names if not known[name]["passed"]]:
+        sys.exit(f"does not run: {', '.join(failed)}")
 
 
 if __name__ == "__main__":

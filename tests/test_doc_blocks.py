@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import tailgate
+from tests.pages import PAGES as ALL
 from tests.pages import ROOT, blocks
 
 PAGES = {  # the packages that a page needs
@@ -25,10 +26,20 @@ BEFORE = {  # what the reader of a page has made already, in a small form
     ],
     "docs/scoring.md": ["evaluate", "--suite", "quick-v1", "--defence", "kf", "--attack", "none", "--seeds", "2", "--out", "rows.jsonl"],
 }  # fmt: skip
+ELSEWHERE = {  # the tests that play the blocks of other pages
+    "docs/detectors.md": "test_docs.py", "docs/distributed.md": "test_doc_blocks.py", "docs/ecosystem.md": "test_ecosystem.py",
+    "docs/environment.md": "test_faces.py", "docs/new-attack.md": "test_docs.py", "docs/new-defence.md": "test_docs.py",
+    "docs/new-parts.md": "test_new_parts.py",
+}  # fmt: skip
 CHANGED = {  # what cannot be had everywhere
     "docs/gpu.md": ('device="cuda"', 'device="cpu"'),
     "docs/replay.md": ('env = gymnasium.wrappers.RecordVideo(env, "films")\n', "" if not find_spec("moviepy") else None),
 }
+
+
+def test_each_page_with_blocks_is_played() -> None:
+    assert {page for page in ALL if blocks(page, "python")} == {*PAGES, *ELSEWHERE}
+    assert all(page in (ROOT / "tests" / test).read_text(encoding="utf-8") for page, test in ELSEWHERE.items())
 
 
 @pytest.mark.thin(8)

@@ -6,6 +6,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 
 from tailgate.base.version import ALIKE
 from tailgate.board.files import load
@@ -113,3 +114,25 @@ def test_constraints_pin_every_requirement_and_name_no_index() -> None:
     wanted = CONFIG["project"]["dependencies"] + [r for group in CONFIG["project"]["optional-dependencies"].values() for r in group]
     names = {re.split(r"[\[><=~! ]", requirement)[0].lower().replace("_", "-") for requirement in wanted} - {"tailgate"}
     assert names <= pinned
+
+
+def test_the_second_set_of_versions_differs_where_rllib_pins() -> None:
+    first, second = (dict(line.split("==") for line in (ROOT / f"constraints{end}.txt").read_text("utf-8").split()) for end in ("", "-rllib"))
+    assert {name: (first[name], second[name]) for name in first if second[name] != first[name]} == {"gymnasium": ("1.4.0", "1.2.2")}
+    assert set(second) - set(first) == {"dm-tree", "lz4", "ormsgpack", "tensorboardX", "wrapt"}  # what RLlib brings
+
+
+def test_the_public_workflows_run_what_there_is() -> None:
+    """Every target of make and script that a workflow names exists; the nightly one runs the long tests and the libraries' snippets."""
+    targets = set(re.findall(r"^([\w./$()-]+(?: [\w-]+)*):", (ROOT / "Makefile").read_text("utf-8").replace("$(VENV)", ".venv"), flags=re.M))
+    known = {target for line in targets for target in line.split()}
+    runs = {}
+    for path in (ROOT / ".github/workflows").glob("*.yml"):
+        jobs = yaml.safe_load(path.read_text("utf-8"))["jobs"]
+        runs[path.stem] = [step["run"] for job in jobs.values() for step in job["steps"] if "run" in step]
+        for text in runs[path.stem]:
+            assert not (made := re.match(r"make (\S+)", text)) or made[1] in known, text
+            for script in re.findall(r"(?:benchmarks|\.ci)/[\w./]+", text):
+                assert (ROOT / script).is_file(), text
+    assert ".ci/run" in runs["ci"] and {"make test-long", "make test-rllib"} <= set(runs["nightly"])
+    assert any("benchmarks/ecosystem.py" in text for text in runs["nightly"])
