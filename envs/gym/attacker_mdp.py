@@ -52,8 +52,9 @@ FACES |= {  # tasks that are worth learning: a budget, decisions that last, no s
         "scenario": "lane-keeping-v0", "defence": "chi2_kf", "value": 0.5, "interval": 20, "threat": {"budget": 60},
     },
 }  # fmt: skip
-for _name in ("CarFollowing", "Platoon"):
-    FACES[f"tailgate/{_name}Continuous-v1"] = FACES[f"tailgate/{_name}-v1"] | {"action": "continuous"}
+for _name in ("CarFollowing", "RadarFollowing", "Platoon"):
+    _face = {key: value for key, value in FACES[f"tailgate/{_name}-v1"].items() if key != "shares"}  # a vector has every size
+    FACES[f"tailgate/{_name}Continuous-v1"] = _face | {"action": "continuous"}
 
 
 class Tally(NamedTuple):
