@@ -6,8 +6,8 @@ from tailgate.core import Prior, Received
 from tailgate.core.draws import Role, keys
 
 
-def play_readings(defence, model, y, mean=None, valid=None):
-    """States and estimates of a defence over readings y (K, B, q) of one agent, from a prior of unit covariance."""
+def play_readings(defence, model, y, mean=None, valid=None, u=None):
+    """States and estimates of a defence over readings y (K, B, q) of one agent, from a prior of unit covariance; inputs u (K, m)."""
     batch, n = y.shape[1], model.states
     plan = defence.prepare(model)
     mean = np.zeros((batch, 1, n)) if mean is None else mean
@@ -16,7 +16,8 @@ def play_readings(defence, model, y, mean=None, valid=None):
     for k, row in enumerate(y):
         there = np.ones(row.shape, bool) if valid is None else valid[k]
         received = Received(row[:, None].copy(), there[:, None].copy(), np.zeros((batch, 1)))
-        state, estimate = defence.step(plan, state, received, np.zeros((batch, 1, model.inputs)), held.at(Role.DEFENCE, np.full(batch, k)))
+        known = np.zeros((batch, 1, model.inputs)) if u is None else np.tile(u[k], (batch, 1, 1))
+        state, estimate = defence.step(plan, state, received, known, held.at(Role.DEFENCE, np.full(batch, k)))
         out.append((state, estimate))
     return plan, out
 

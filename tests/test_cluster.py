@@ -1,5 +1,7 @@
 """Jobs on a Ray cluster of two processes on this machine: the same results as of local workers, lost ones are played again."""
 
+import contextlib
+import json
 import os
 import sys
 from pathlib import Path
@@ -77,6 +79,50 @@ def test_rows_are_those_of_local_workers(on_ray, tmp_path):
     with pool.hired(pool.Crew):
         assert cli.main([*words, "--out", str(tmp_path / "here.jsonl")]) == 0
     assert (tmp_path / "away.jsonl").read_bytes() == (tmp_path / "here.jsonl").read_bytes()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("words", "files"),
+    [
+        (["trust", "--scenario", "gusty-stop-and-go-v0", "--defence", "kf", "--attack", "none", "--attack", "fdi", "--runs", "20"],
+         ["cells.jsonl", "trust.json"]),
+        (["leaderboard", "run", "quick-v0", "--defence", "kf", "--defence", "chi2_kf"], ["quick-v0/board.json"]),
+        (["attack", "kf", "--suite", "radar-v0", "--scenario", "radar-braking-v0", "--dose", "2", "--budget", "quick", "--episodes", "20"],
+         ["attacks.txt"]),
+    ],
+    ids=["trust", "leaderboard", "attack"],
+)  # fmt: skip
+def test_other_commands_write_what_local_workers_write(on_ray, tmp_path, words, files):
+    for place in ("away", "here"):
+        local = pool.hired(pool.Crew) if place == "here" else contextlib.nullcontext()
+        with local, contextlib.chdir(tmp_path):  # `attack` writes the paths of its files
+            assert cli.main([*words, "--workers", "2", "--out", "out"]) == 0
+            (tmp_path / "out").rename(tmp_path / place)
+    for name in files:
+        assert (tmp_path / "away" / name).read_bytes() == (tmp_path / "here" / name).read_bytes(), name
+
+
+@pytest.mark.long
+def test_a_tuning_tries_what_a_local_one_tries(on_ray, tmp_path, capsys):
+    words = ["tune", "--trials", "2", "--episodes", "20", "--json", "learner=cem", "cem.population=8", "steps=2000"]
+    assert cli.main([*words, f"out={tmp_path / 'away'}"]) == 0
+    away = json.loads(capsys.readouterr().out)
+    with pool.hired(pool.Crew):
+        assert cli.main([*words, f"out={tmp_path / 'here'}"]) == 0
+    here = json.loads(capsys.readouterr().out)
+    tried = [[(trial["parameters"], trial["value"]) for trial in report["trials"]] for report in (away, here)]
+    assert tried[0] == tried[1] and len(tried[0]) == 2
+
+
+@pytest.mark.long
+def test_two_killed_workers_and_a_killed_driver_cost_no_row(tmp_path, monkeypatch):
+    pytest.importorskip("ray")
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    import cluster as campaign
+
+    found = campaign.loss(200_000, tmp_path, 0)
+    assert found["equal"] and (found["workers_killed"], found["driver_killed"]) == (2, 1)
 
 
 def test_without_ray_one_line_says_which_extra(monkeypatch, capsys):

@@ -21,7 +21,7 @@ import numpy as np
 from pydantic import Field
 
 from tailgate import num
-from tailgate.base.errors import unknown
+from tailgate.base.errors import InputError, unknown
 from tailgate.core import Array, Estimate, Finite, Mode, Model, NonNegative, Positive, Prior, Probability, Received, param
 from tailgate.core.draws import Draws
 from tailgate.core.registry import register
@@ -68,6 +68,10 @@ class Bernoulli:
     merge: NonNegative = param(4.0, "of several: squared Mahalanobis distance below which two are merged [-]")
     prune: Probability = param(1e-5, "of several: weight below which one is left out [-]")
     threshold: Finite = param(0.0, "alarm above these log odds of an attack; 0: probability 1/2 [-]")
+
+    def __post_init__(self) -> None:
+        if self.components > 1 and self.prune * 2 * self.components >= 1.0:  # one of 2 J weighs at least 1 / (2 J)
+            raise InputError("defence bernoulli.prune", self.prune, f"below 1 / (2 components), {0.5 / self.components:g}")
 
     def prepare(self, model: Model) -> BernoulliPlan:
         for name in self.attacked:

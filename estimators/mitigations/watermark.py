@@ -13,13 +13,28 @@ Where calA is unstable the replay shows without a watermark (`bounds.replay_mean
 from dataclasses import dataclass
 from typing import ClassVar
 
-from tailgate.core import Array, Estimate, NonNegative, Positive, PositiveCount, Received, param
+import numpy as np
+
+from tailgate.core import Array, Estimate, Model, NonNegative, Positive, PositiveCount, Received, param
 from tailgate.core.draws import Draws
 from tailgate.core.registry import register
-from tailgate.estimators.compose import AcceptAll, Composed, ComposedPlan, ComposedState
+from tailgate.estimators.compose import Composed, ComposedPlan, ComposedState, Reaction, ReactionPlan, quiet
 from tailgate.estimators.detectors.sequential import WindowedChiSquare
 from tailgate.estimators.filters.kalman import KalmanFilter
-from tailgate.estimators.parts import Detector, Filter, Mitigation
+from tailgate.estimators.parts import Decision, Detector, Filter, Mitigation, Verdict
+
+
+@dataclass(frozen=True)
+class Marking(Reaction[None, Array]):
+    """Uses whatever was received; holds the watermark's standard deviation for each actuator (m,)."""
+
+    sd: NonNegative = param(0.3, "standard deviation of what is added to the command [unit of the actuator]")
+
+    def constants(self, model: Model) -> Array:
+        return np.full(len(model.actuators), self.sd)
+
+    def choose(self, plan: ReactionPlan[Array], state: None, verdict: Verdict, received: Received) -> tuple[None, Decision]:
+        return None, Decision(received.valid, quiet(verdict))
 
 
 @register(
@@ -31,16 +46,16 @@ class Watermark(Composed):
     """Kalman filter under the windowed chi-square test, which adds secret noise to the command: replayed readings do not show it."""
 
     threshold_field: ClassVar[str] = "threshold"
-    sd: NonNegative = param(0.3, "standard deviation of what is added to the command [m/s^2]")
+    sd: NonNegative = param(Marking.sd, "standard deviation of what is added to the command [unit of the actuator]")
     threshold: Positive = param(WindowedChiSquare.threshold, "threshold on the sum of r' S^-1 r [-]")
     window: PositiveCount = param(WindowedChiSquare.window, "length of the window [steps]")
 
     def parts(self) -> tuple[Filter, Detector, Mitigation]:
-        return KalmanFilter(), WindowedChiSquare(self.threshold, self.window), AcceptAll()
+        return KalmanFilter(), WindowedChiSquare(self.threshold, self.window), Marking(sd=self.sd)
 
     def step(
         self, plan: ComposedPlan, state: ComposedState, received: Received, known_u: Array, draws: Draws
     ) -> tuple[ComposedState, Estimate]:
         state, estimate = super().step(plan, state, received, known_u, draws)
-        agents, inputs = known_u.shape[1:]
-        return state, estimate._replace(offset=self.sd * draws.normal((agents, inputs)))
+        sd = plan.mitigation_plan.own
+        return state, estimate._replace(offset=sd * draws.normal((known_u.shape[1], len(sd))))

@@ -170,4 +170,4 @@ class RobustDecoder(Decoder):
                 continue  # too much is missing to tell
             found = explanation(O[i], Y, D[i], there, self.s, self.centre)
             x[b, i], alarm[b, i] = found.x, bool(found.attacked) or not found.found
-        return None, Decoded(x, score, alarm)
+        return None, Decoded(x, np.where(alarm, score, np.minimum(score, self.sigmas)), alarm)  # some x has all errors within the bounds

@@ -130,7 +130,7 @@ class ProjectedGradient(Relaxed):
     nu: Fraction = param(0.3, "share by which f falls before a projection is triggered [-]")
     threshold: Positive | None = param(None, "alarm where the least squares of all sensors leaves more, over the noise; none: by alpha [-]")
     eps: Positive | None = param(None, "f at which the iteration ends; none: what noise has, T tr R [unit of the rows, squared]")
-    alpha: Tail = param(1e-4, "probability that the window of a matched model exceeds the threshold [-]")
+    alpha: Tail = param(1e-4, "probability that a window of a model without process noise exceeds the threshold [-]")
     rounds: Rounds = param(100, "gradient steps in a period, at most")
 
     def constants(self, plan: WindowPlan, model: Model) -> ProjectedPlan:
