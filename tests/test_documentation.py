@@ -220,12 +220,12 @@ def test_a_tutorial_runs_to_the_outputs_that_it_shows(path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The site, built strictly without boards, which tests of their own draw."""
+    """The site, built strictly, with its boards."""
     for name in ("sphinx", "furo", "myst_nb", "numpydoc"):
         pytest.importorskip(name, reason="the extra docs is not installed")
     folder = tmp_path_factory.mktemp("docs")
     command = [sys.executable, "-m", "sphinx", "--builder", "html", "--fail-on-warning", "--keep-going", "--quiet", "--jobs", "2"]
-    command += ["-D", "tailgate_boards=0", "--doctree-dir", str(folder / "doctrees"), str(DOCS), str(folder / "site")]
+    command += ["--doctree-dir", str(folder / "doctrees"), str(DOCS), str(folder / "site")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return (folder / "site").resolve()
@@ -236,13 +236,14 @@ def test_links_of_the_built_site_lead_somewhere_and_none_loads_from_the_net(site
     pages = sorted(site.rglob("*.html"))
     texts = {page: page.read_text(encoding="utf-8") for page in pages}
     ids = {page: set(re.findall(r'\bid="([^"]+)"', text)) for page, text in texts.items()}
-    assert len(pages) > 300
+    assert len(pages) > 300 and sum(page.is_relative_to(site / "boards") for page in pages) > 150
+    assert 'href="thesis/index.html"' in texts[site / "reproduction.html"] and site / "thesis/index.html" in texts
     for page, text in texts.items():
         loaded = re.findall(r'<(?:script|link|img|iframe|source)\b[^>]*?\b(?:src|href)="([^"]+)', text)
-        assert not [name for name in loaded if "//" in name], page
+        assert not [name for name in loaded if "//" in name and not name.startswith("data:")], page
         for name, _, anchor in (unquote(found).partition("#") for found in {*loaded, *re.findall(r'<a\b[^>]*?\bhref="([^"]+)', text)}):
             at = (page.parent / name.partition("?")[0]).resolve() if name else page
-            if "://" in name or name.startswith(("mailto:", "data:")) or at.is_relative_to(site / "boards"):
+            if "://" in name or name.startswith(("mailto:", "data:")):
                 continue
             assert at.is_file(), f"{page}: {name}"
             assert not anchor or at not in ids or anchor in ids[at], f"{page}: {name}#{anchor}"
@@ -261,3 +262,39 @@ def test_search_works_from_the_folder(site: Path, browser: Any, asked: Any) -> N
         assert found[0].text.startswith("chi2_kf")
         assert all(address.startswith("file:") for address in asked())
         assert browser.execute_script("return document.documentElement.scrollWidth <= document.documentElement.clientWidth")
+
+
+SEEN = """
+const lin = x => (x /= 255) <= 0.04045 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4
+const parts = c => { const [r, g, b, a = 1] = c.match(/[\\d.]+/g).map(Number); return [r, g, b, a] }
+const grey = ([r, g, b]) => 0.2126 * lin(r) + 0.7152 * lin(g) + 0.0722 * lin(b)
+const ground = e => { for (; e; e = e.parentElement) { const c = parts(getComputedStyle(e).backgroundColor); if (c[3] === 1) return c } return [255, 255, 255] }
+const contrast = (ink, e) => { const [low, high] = [grey(parts(ink)), grey(ground(e))].sort((a, b) => a - b); return (high + 0.05) / (low + 0.05) }
+const texts = [], walk = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT)
+for (let t; (t = walk.nextNode());) {
+  const e = t.parentElement
+  if (t.data.trim() && !e.closest('script, style, .headerlink') && e.checkVisibility({checkOpacity: true, checkVisibilityCSS: true}))
+    texts.push([t.data.trim(), contrast(getComputedStyle(e).color, e)])
+}
+const links = [...document.querySelectorAll('article a[href]:not(.headerlink)')].filter(a => a.textContent.trim() && a.checkVisibility()).map(a => {
+  const s = getComputedStyle(a)
+  return [a.textContent.trim(), s.textDecorationLine, contrast(s.textDecorationColor, a)]
+})
+return {texts, links, bare: [...document.images].filter(i => !i.alt).map(i => i.src),
+        wide: document.documentElement.scrollWidth, room: document.documentElement.clientWidth}
+"""
+
+
+@pytest.mark.long
+@pytest.mark.page
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_pages_fit_a_phone_and_need_no_colour(site: Path, browser: Any, show: Any, scheme: str) -> None:
+    """No page is wider than 400 px. In greys text is readable, links are ruled, and pictures have words."""
+    show(400, scheme)
+    for name in ("index", "generated/components/defence/chi2_kf", "generated/replays", "guide", "thesis/index"):
+        browser.get((site / f"{name}.html").as_uri())
+        seen = browser.execute_script(SEEN)
+        assert seen["wide"] <= seen["room"] <= 400, name
+        assert len(seen["texts"]) > 100 and [text for text, contrast in seen["texts"] if contrast < 4.5] == [], name
+        assert [text for text, line, contrast in seen["links"] if "underline" not in line or contrast < 3] == [], name
+        assert (seen["links"] or name == "thesis/index") and seen["bare"] == [], name

@@ -62,6 +62,7 @@ def test_the_page_is_quiet(tab, pages, name, asked):
 def test_the_slider_moves_the_playhead_and_the_words(tab):
     """Time, attack, alarm, budget, values and playhead at a step are those of the trace, and the road changes."""
     page = tab()
+    to(page, 0)
     shot = "return document.getElementById('road').toDataURL()"
     assert text_of(page, "time") == "t = 0.0 s" and "before the first step" in text_of(page, "attack")
     start, before = page.execute_script(shot), page.find_element("css selector", ".playhead").get_attribute("x1")
@@ -93,9 +94,24 @@ def test_an_address_opens_at_its_step(tab, pages, name, step):
 
 
 @pytest.mark.page
+@pytest.mark.parametrize("name", ["attacked", "thesis"])
+def test_a_page_opens_at_the_first_attacked_step(tab, pages, name):
+    """The attack is seen at once, where the address names no step; step 0 can be named."""
+    page = tab(name)
+    kinds = page.execute_script("return JSON.parse(document.getElementById('episode').textContent).kind")
+    first = next(step for step, kind in enumerate(kinds, 1) if kind)
+    assert first > 1 and text_of(page, "step").startswith(f"step {first} of ") and "ATTACK" in text_of(page, "attack")
+    for part, step in (("metrics", first), ("0", 0)):
+        page.get("about:blank")
+        page.get(f"{pages[name].as_uri()}#{part}")
+        assert text_of(page, "step").startswith(f"step {step} of ")
+
+
+@pytest.mark.page
 def test_the_keyboard_is_enough(tab):
     """Arrows step, Shift makes it ten, Home and End go to the ends on the slider, space plays and halts."""
     page = tab()
+    to(page, 0)
     slider = page.find_element("id", "slider")
     page.execute_script("arguments[0].focus()", slider)
     for key, step in (("\ue014", 1), ("\ue014", 2), ("\ue012", 1), ("\ue010", None), ("\ue011", 0)):  # right, right, left, end, home

@@ -171,7 +171,7 @@ def test_the_picture_says_what_the_plots_say(name, replays, tmp_path, browser):
         replay = play(run_cell(Cell("s", str(path), None, "kf", "echo_delay:start_step=10,delay=15", 1))[0])
     data = episode_of(replay)
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", {"width": 1280, "height": 800, "deviceScaleFactor": 1, "mobile": False})
-    browser.get(write_page(replay, tmp_path / "page.html").as_uri())
+    browser.get(write_page(replay, tmp_path / "page.html").as_uri() + "#0")
     browser.execute_script("""
         window.said = [];
         const fill = CanvasRenderingContext2D.prototype.fillText;

@@ -15,7 +15,7 @@ from tailgate.evaluation.stats import proportion
 from tailgate.thesis import ch7_automata, ch7_cost, ch7_loop, ch7_ratings, ch7_signals, ch7_trust, ch7_width, whole, whole_theorems
 from tailgate.thesis.claims import Claim, Figure, Report, Table
 from tailgate.thesis.run import CHAPTERS, flat, read, write
-from tailgate.thesis.whole import Item, check_coverage, load_coverage, reproduce_whole, write_whole
+from tailgate.thesis.whole import Item, check_coverage, load_coverage, read_whole, reproduce_whole, write_whole
 from tailgate.trust.cells import Outcome
 
 ROOT = Path(__file__).parents[1]
@@ -238,3 +238,28 @@ def test_the_command_without_a_chapter(tmp_path, covered, monkeypatch, capsys):
         assert page.count(f'id="show-{verdict}" checked') == 1 and f"body:has(#show-{verdict}:not(:checked)) .claim.{verdict}" in page
     assert cli.main(["reproduce", "--seeds", "9", "--out", str(tmp_path / "few")]) == 2
     assert "seeds" in capsys.readouterr().err and not (tmp_path / "few").exists()
+
+
+def test_the_published_report_is_read_back():
+    """Its Markdown comes out byte for byte; the page has every claim, filters, and the version that measured."""
+    published = ROOT / "results/reproduction"
+    held = read_whole(published)
+    assert whole.markdown(held).encode() == (published / "report.md").read_bytes()
+    text = whole.html(held)
+    assert all(f'id="{claim.id}"' in text for claim in held.claims) and len(held.claims) == 114
+    assert 'id="show-partly"' in text and "<dt>Tailgate</dt><dd>0.1.0</dd>" in text and text.count("data:image/png;base64,") == 23
+
+
+def test_a_folder_without_a_whole_report_is_refused(tmp_path, covered):
+    """No file, another file, a chapter that is gone."""
+    with pytest.raises(InputError, match=r"report\.json"):
+        read_whole(tmp_path)
+    (tmp_path / "report.json").write_text("[]")
+    with pytest.raises(InputError, match="a report of all chapters"):
+        read_whole(tmp_path)
+    made = reproduce_whole(10, tmp_path, play=Chapters())
+    write_whole(made, tmp_path)
+    assert read_whole(tmp_path) == dataclasses.replace(made, kept=())
+    (tmp_path / "ch5/report.json").unlink()
+    with pytest.raises(InputError, match="ch5"):
+        read_whole(tmp_path)

@@ -73,6 +73,7 @@ def test_groups_order_and_figures(index):
     rates = {(r["dose"], r["knowledge"]): r["undamaged"] for r in kf["rates"]}
     for dose in (10, 20, 40):
         assert f"{percent(rates[dose, 'white']['value'])} ≥ {at_least(rates[dose, 'white']['low'])}" in rows[1]
+    assert re.match(r"kf measurements (\d+% ≥ \d+% ){9}1 of 3 ≤ 5", rows[1])  # the shares, then the rank
     brake = next(row for row in rows if row.startswith("brake_kf"))
     assert "> 200" in brake and "to > 200" in brake  # beyond the largest dose
     assert any(row.startswith("none baseline: no defence") for row in rows)

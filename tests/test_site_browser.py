@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tailgate.board.words import percent
+from tailgate.site.build import build_site
 
 spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
 boards = importlib.util.module_from_spec(spec)
@@ -43,7 +44,7 @@ def test_every_heading_sorts_both_ways_within_groups(tab):
     assert len(buttons) == 11
     names = [sorted(group) for group in groups(tab, 0)]
     for column, button in enumerate(buttons):
-        key = "black" if column in (3, 4, 5) else "sort"
+        key = "black" if column in (2, 3, 4) else "sort"
         for direction in ("ascending", "descending"):
             tab.execute_script("arguments[0].focus()", button)
             tab.switch_to.active_element.send_keys("\ue007")  # Enter: the keyboard is enough
@@ -164,12 +165,12 @@ SEEN = """return [...document.querySelectorAll(arguments[0])].map(t => [t.innerT
 
 @pytest.mark.page
 def test_what_tells_most_stands_in_a_phone_without_scrolling(tab, site, show):
-    """A board shows name, rank and undamaged shares, the class below the name. An entry shows gates, the worst damage and who is weaker."""
+    """A board shows name and undamaged shares, the class below the name. An entry shows gates, the worst damage and who is weaker."""
     show(420, "light")
     tab.get(site.as_uri())
     heads = dict(tab.execute_script(SEEN, "#suite-1 .ranks thead th"))
     whole = [head for head, seen in heads.items() if seen]
-    assert whole[:2] == ["Defence", "Rank"] and sum("Undamaged" in head for head in whole) >= 2 and heads["Class"] is False
+    assert whole[0] == "Defence" and sum("Undamaged" in head for head in whole) >= 2 and heads["Class"] is False
     below = "return getComputedStyle(document.querySelector('#suite-1 tr[data-row=\"0\"] th'), '::after').content"
     assert tab.execute_script(below) == '"measurements"'
     tab.get(entry(site, "chi2_kf:eta=15").as_uri())
@@ -179,6 +180,38 @@ def test_what_tells_most_stands_in_a_phone_without_scrolling(tab, site, show):
     tab.get(site.as_uri())
     assert dict(tab.execute_script(SEEN, "#suite-1 .ranks thead th"))["Class"]
     assert tab.execute_script(below) == "none"
+
+
+@pytest.fixture(scope="module")
+def single(tmp_path_factory):
+    """A page for each of two boards, as a board is published: one with several doses, one with one dose."""
+    several, one = make_board("of-several-doses-v0"), make_board("of-a-single-dose-v0", doses=[3])
+    for board in (several, one):  # as long as a published one
+        board["suite"]["about"] = "Cars with adaptive cruise control on a windy road, behind one that brakes hard. The attacker may add up to 3 m (m/s), or jam."
+    return [build_site([board], tmp_path_factory.mktemp("single"), title=f"Tailgate: {board['suite']['name']}", replays=False) for board in (several, one)]
+
+
+@pytest.mark.page
+@pytest.mark.parametrize("which", [0, 1], ids=["several doses", "one dose"])
+def test_the_first_defence_is_seen_in_a_phone_without_scrolling(browser, single, which, show):
+    """Filters are folded there and open on demand; the name of the suite is not shown twice. The share comes before the rank."""
+    show(400)
+    browser.get(single[which].as_uri())
+    place = "const b = document.querySelector(arguments[0]).getBoundingClientRect(); return [b.top, b.bottom]"
+    top, bottom = browser.execute_script(place, "#suite-1 .ranks tr[data-row]")
+    assert 0 < top < bottom <= 800
+    assert browser.execute_script("return scrollY") == 0 and browser.find_element("id", "title-1").size["height"] <= 1
+    heads = browser.execute_script("return [...document.querySelectorAll('#suite-1 .ranks thead th')].map(h => h.textContent.trim())")
+    shares = [i for i, head in enumerate(heads) if head.startswith("Undamaged")]
+    assert len(shares) == (1 if which else 3) and shares[-1] + 1 == heads.index("Rank")
+    find, fold = browser.find_element("css selector", "#suite-1 .find"), browser.find_element("css selector", "#suite-1 .fold > summary")
+    assert not find.is_displayed() and browser.find_element("css selector", "#suite-1 .filters output").text == "12 of 12 defences"
+    fold.click()
+    find.send_keys("cusum")
+    assert browser.find_element("css selector", "#suite-1 .filters output").text == "1 of 12 defences"
+    show(1280)
+    browser.get(single[which].as_uri())
+    assert browser.find_element("css selector", "#suite-1 .find").is_displayed() and not browser.find_element("css selector", "#suite-1 .fold > summary").is_displayed()
 
 
 @pytest.mark.page

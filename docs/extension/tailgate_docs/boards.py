@@ -85,13 +85,13 @@ def gallery(boards: dict[str, Path]) -> str:
     for name, path in boards.items():
         board = load(path)
         asked = replayed(name, board)
-        out += [f"## {name}", "", "| defence | strongest attack | scenario | outcome |", "|---|---|---|---|"]
+        out += [f"## {name}", "", "| defence | outcome | scenario | strongest attack |", "|---|---|---|---|"]
         for entry in board["entries"]:
             row = entry["worst_episode"]
             if entry["defence"] in asked and row is not None:
                 link = f'<a href="../boards/{name}/{replay(name, entry["defence"])}">{entry["defence"].replace("|", "")}</a>'
                 attack = row["attack"].rsplit("/", 1)[-1].replace("|", "")
-                out.append(f"| {link} | `{attack}` | {row['scenario']} | {_outcome(row)} |")
+                out.append(f"| {link} | {_outcome(row)} | {row['scenario']} | `{attack}` |")
         out.append("")
     return "\n".join(out)
 

@@ -13,12 +13,13 @@ from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 from sphinx.transforms.post_transforms import SphinxPostTransform
 
-from . import api, boards, components, staged
+from . import api, boards, components, staged, thesis
 from .links import Links, section
 
 GENERATED = "generated"
 _FROM_README = re.compile(r"<!-- from README: ([^>]+?) -->")
 _DECISIONS = "<!-- list of decisions -->"
+_THESIS = "<!-- page of the reproduction -->"
 _LISTED = re.compile(r"generated/components/\w+/(?!index).*|generated/reports/(?!index$).*|decisions/0.*")
 _FAMILIES = ("defence", "attack", "scenario", "suite", "metric", "plant", "sensor", "detector", "filter", "mitigation", "controller", "manoeuvre")
 
@@ -87,6 +88,7 @@ def _read(app: Sphinx, docname: str, content: list[str]) -> None:
     text = _FROM_README.sub(lambda found: links.rebased(section(whole, found[1]), readme, path), text)
     records = sorted(path.parent.glob("0*.md")) if _DECISIONS in text else []
     heads = [(record.name, record.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")) for record in records]
+    text = text.replace(_THESIS, thesis.LINK)
     content[0] = text.replace(_DECISIONS, "\n".join(f"- [{head}]({name})" for name, head in heads))
 
 
@@ -163,6 +165,8 @@ def _begin(app: Sphinx) -> None:
 
 
 def _end(app: Sphinx, error: Exception | None) -> None:
+    if error is None and app.builder.name == "html":
+        thesis.draw(Path(app.srcdir).resolve().parent, Path(app.outdir))
     drawing = _held.drawing
     if drawing is None:
         return

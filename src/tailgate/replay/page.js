@@ -153,5 +153,6 @@
     menu.addEventListener("change", () => choose(Number(menu.value)));
   }
   new ResizeObserver(() => drawScene(canvas, episode, now, agent)).observe(canvas);
-  show(Number.parseInt(location.hash.slice(1), 10) || 0); // page.html#290: from step 290 on
+  const named = Number.parseInt(location.hash.slice(1), 10); // page.html#290: from step 290 on
+  show(Number.isNaN(named) ? (attacked[0]?.[0] ?? 0) : named);
 })();

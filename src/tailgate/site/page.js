@@ -146,6 +146,11 @@
       for (const chart of section.querySelectorAll(".scale")) chart.hidden = !chart.classList.contains(axis.value);
     });
   }
+  // where there is little room the filters are folded: the first defences shall be seen
+  const wide = matchMedia("(min-width: 48.01rem)");
+  const unfold = () => document.querySelectorAll(".fold").forEach((fold) => (fold.open = wide.matches));
+  wide.addEventListener("change", unfold);
+  unfold();
   // browsers keep the choice of a menu over a reload, but not what it did
   document.querySelectorAll("select").forEach((menu) => menu.dispatchEvent(new Event("change")));
   document.querySelectorAll(".filters").forEach((box) => (box.hidden = false));

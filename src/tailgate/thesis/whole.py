@@ -14,6 +14,7 @@ from tailgate.base import sources
 from tailgate.base.errors import InputError
 from tailgate.base.files import sweep, writable_directory, write_atomic
 from tailgate.base.locks import alone
+from tailgate.base.reading import load_json
 from tailgate.base.version import VERSION
 from tailgate.core import param
 from tailgate.core.schema import build, read_yaml
@@ -46,6 +47,7 @@ class Whole:
     seconds: dict[str, float]
     kept: tuple[str, ...]  # chapters that an earlier run had finished
     coverage: list[Item]
+    version: str = VERSION
 
     @property
     def claims(self) -> list[Claim]:
@@ -123,7 +125,7 @@ def facts(whole: Whole) -> dict[str, str]:
         "seeds": f"{whole.seeds} where a chapter does not say otherwise",
         "run time": f"{total / 60.0:.1f} minutes of wall-clock time" + (f", of which earlier: {kept}" if kept else ""),
         "measured": "median [quartiles] over seeds, or a share with its exact 95 % interval, where nothing else is said",
-        "Tailgate": VERSION,
+        "Tailgate": whole.version,
     }
 
 
@@ -157,7 +159,7 @@ def markdown(whole: Whole) -> str:
 def as_data(whole: Whole) -> dict[str, Any]:
     """Return the report as JSON data."""
     return {
-        "title": TITLE, "version": VERSION, "seeds": whole.seeds, "sources": whole.sources, "seconds": whole.seconds,
+        "title": TITLE, "version": whole.version, "seeds": whole.seeds, "sources": whole.sources, "seconds": whole.seconds,
         "chapters": {
             r.chapter: data_of(r) | {"figures": [f"{r.chapter}/{f.name}.png" for f in r.figures]} for r in whole.reports
         },
@@ -176,10 +178,33 @@ def write_whole(whole: Whole, directory: Path) -> Path:
         raise InputError("coverage: figures", sorted(missing), "figures that a chapter draws")
     write_atomic(directory / "report.json", json.dumps(as_data(whole), indent=1, allow_nan=False).encode() + b"\n")
     write_atomic(directory / "report.md", markdown(whole).encode())
-    text = page(
+    write_atomic(directory / "index.html", html(whole).encode())
+    sweep(directory)
+    return directory / "index.html"
+
+
+def html(whole: Whole) -> str:
+    """Return the report as one self-contained page."""
+    return page(
         "whole.html", title=TITLE, summary=summary(*whole.reports), reports=whole.reports, facts=facts(whole), counts=counts(whole),
         coverage=whole.coverage, covered=covered(whole.coverage), verdicts={claim.id: claim.holds for claim in whole.claims},
     )  # fmt: skip
-    write_atomic(directory / "index.html", text.encode())
-    sweep(directory)
-    return directory / "index.html"
+
+
+def read_whole(directory: Path) -> Whole:
+    """Return the report that `write_whole` wrote into a directory, with the version that wrote it.
+
+    Which chapters were kept from an earlier run is not in it. Raises InputError for what is no such report.
+    """
+    try:
+        data = load_json(directory / "report.json")
+        items = [build(Item, held, f"coverage, item {i}") for i, held in enumerate(data["coverage"], start=1)]
+        found = [(name, read(directory / name)) for name in data["chapters"]]
+        reports = [held[0] for _, held in found if held]
+        if missing := [name for name, held in found if held is None]:
+            raise InputError(str(directory), missing, "a report.json and the figures of each chapter")
+        return Whole(data["seeds"], data["sources"], reports, data["seconds"], (), items, data["version"])
+    except InputError:
+        raise
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(str(directory / "report.json"), str(error), "a report of all chapters") from None
