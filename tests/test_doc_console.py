@@ -33,6 +33,7 @@ EXCEPTED = {
     "python benchmarks/literature.py": "a study of hours",
     "python results/adversaries-v0/adversaries.py": "a study of hours, with a word that stands for a cell",
     "README.md: tailgate leaderboard try mydefence:Class": "a name that stands for a class; docs/new-defence.md has one",
+    "docs/scoring.md: tailgate leaderboard run": "published boards, an hour each; tests/test_scoring_runs.py and test_scoring_attacks.py have small ones",
     "docs/submissions.md: tailgate leaderboard admit": "words that stand for names; tests/test_scoring_attacks.py admits attacks",
     "docs/submissions.md: tailgate leaderboard run NAME": "words that stand for names",
     "tailgate zoo add": "writes into the package; tests/test_zoo.py adds to another folder",
