@@ -147,6 +147,14 @@ def replay_mean(A: Array, B: Array, C: Array, L: Array, K: Array, S: Array, Qu: 
     return float(len(C) + 2.0 * np.trace(C.T @ np.linalg.solve(S, C @ U)))
 
 
+def watermark_cost(B: Array, S: Array, V: Array, Qu: Array) -> float:
+    """Return by how much a watermark Qu raises the mean of x'Wx + u'Vu under the optimal feedback: tr((V + B'SB) Qu).
+
+    S solves the Riccati equation of the feedback: S = W + A'SA - A'SB (V + B'SB)^-1 B'SA.
+    """
+    return float(np.trace((V + B.T @ S @ B) @ Qu))
+
+
 def lock_out(steady: Steady, Q: Array, steps: int, index: int = 0) -> float:
     """Return about how many honest samples a gate rejects after `steps` stealth steps along state `index`, while that is positive.
 
