@@ -14,7 +14,7 @@ import pytest
 
 from tailgate.base import interrupts
 from tailgate.base.pool import Crew, each
-from tailgate.cli import main
+from tailgate.cli import command_line, main
 
 spec = importlib.util.spec_from_file_location("crash_campaign", Path(__file__).parents[1] / "benchmarks" / "crash_campaign.py")
 assert spec is not None and spec.loader is not None
@@ -135,6 +135,20 @@ def test_a_library_that_raises_its_own_interrupt_does_not_hide_the_signal(monkey
         ending.handle(signal.SIGTERM, None)
     assert ending.last_words(KeyboardInterrupt()) == 143
     assert capsys.readouterr().err == "tailgate: terminated; the same command goes on\n"
+
+
+def test_an_import_that_the_signal_broke_is_no_traceback(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """A compiled module that was cut off cannot be imported again while the command unwinds."""
+
+    def broken(*_: object) -> Any:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        finally:
+            raise ImportError('generic_type: type "ObjSense" is already registered!')
+
+    monkeypatch.setattr(command_line._Parser, "parse_args", broken)
+    assert main(["list"]) == 130
+    assert capsys.readouterr().err == "tailgate: interrupted; nothing of it is kept\n"
 
 
 def test_elsewhere_handlers_are_put_back(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -96,8 +96,8 @@ class Ending:
                         _end(numbers[0], self.kept(), self.said)
                     return
 
-    def last_words(self, error: KeyboardInterrupt) -> int:
-        """Print the last line of the command and return its exit code."""
+    def last_words(self, error: BaseException) -> int:
+        """Print the last line of the command and return its exit code; error: what ended it."""
         _kill_workers()
         terminated = isinstance(error, Terminated) or self.number == signal.SIGTERM  # Ray raises a plain KeyboardInterrupt for every signal
         number = signal.SIGTERM if terminated else signal.SIGINT

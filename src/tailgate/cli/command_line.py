@@ -46,21 +46,20 @@ def _done(arguments: Sequence[str] | None, chosen: argparse.Namespace, ending: E
         _parser().parse_args(arguments, chosen)
         with _place(chosen):
             return int(chosen.run(chosen))
-    except InputError as error:
+    except BrokenPipeError:  # the reader of our output has gone
+        sys.stderr.close()
+        return 0
+    except KeyboardInterrupt as error:
+        return ending.last_words(error)
+    except Exception as error:
+        if ending.number:  # a module whose import is cut off may not be importable again while the command unwinds
+            return ending.last_words(error)
+        if not isinstance(error, InputError) and not (isinstance(error, ImportError) and "tailgate[" in str(error)):
+            raise
         print(f"tailgate: error: {error}", file=sys.stderr)
         if isinstance(error, Killed):
             print(f"tailgate: {_kept(chosen)}", file=sys.stderr)
         return EXIT_INPUT
-    except ImportError as error:
-        if "tailgate[" not in str(error):
-            raise
-        print(f"tailgate: error: {error}", file=sys.stderr)
-        return EXIT_INPUT
-    except KeyboardInterrupt as error:
-        return ending.last_words(error)
-    except BrokenPipeError:  # the reader of our output has gone
-        sys.stderr.close()
-        return 0
 
 
 @contextmanager
