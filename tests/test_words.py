@@ -18,10 +18,16 @@ RECORDED = {  # their strings are in published boards, and in reports of claims
     "thesis/ch7_automata.py", "thesis/ch7_trust.py", "estimators/challenge/challenge_response.py", "estimators/safe_set/safe_state.py",
 }  # fmt: skip
 OPENINGS = re.compile(r"(What|Of|Whose|Whether|Whoever)\b")
-DIALECT = re.compile(r"\b(beside|anew|so many|whoever|told|stands|of (its|his|their) own)\b", re.IGNORECASE)
+DIALECT = re.compile(  # "a rule of its own", and not "the echo of its own probe"
+    r"\b(beside|anew|so many|whoever|told|stands|of (its|his|their) own(?! (?!(that|which|for|in|on|and|or|at|to|with|by|as|is)\b)\w))\b",
+    re.IGNORECASE,
+)
 CODE = re.compile(r"`[^`\n]*`")  # names of the code
+QUOTED = re.compile(r'"[^"]*"')
 WORD = re.compile(r"(?<!\S)[A-Za-z'`-]+[,;:.]*(?!\S)")  # parts of formulas do not count
 MOST = 25  # words in a sentence
+PAGES = ["README.md", "CONTRIBUTING.md"]
+PAGES += [str(path.relative_to(ROOT)) for folder in ("docs", "docs/results") for path in (ROOT / folder).glob("*.md")]
 FILES = {str(path.relative_to(SOURCE)): path for path in SOURCE.rglob("*.py") if path.relative_to(SOURCE).parts[0] not in TOP}
 FILES |= {str(path.relative_to(ROOT)): path for folder in TOP for path in (ROOT / folder).rglob("*.py")}
 
@@ -51,3 +57,46 @@ def test_words_are_plain(name: str) -> None:
     found += [(line, f"says {at[0]!r}") for line, text in [*comments, *strings] if (at := DIALECT.search(CODE.sub("", text)))]
     long = [(line, part) for line, text in docstrings for part in _sentences(text) if len(WORD.findall(part)) > MOST]
     assert found + long == [], "plain words: see docs/glossary.md and CONTRIBUTING.md"
+
+
+def _prose(page: str) -> list[str]:
+    """Return the sentences of a page, list items included; code, tables, headings and comments are not prose."""
+    text = re.sub(r"(?ms)^ *```.*?^ *```$|<!--.*?-->|^\$\$.*?^\$\$$", "", page)
+    text = re.sub(r"(?m)^(?: *(?:[|#:<]|\[[^\]]*\]: )| {4,}(?![-*] |\d+\. )).*$", "\n", text)  # tables, headings, directives, HTML, code
+    text = re.sub(r"(?m)^ *(?:[-*>]|\d+\.) ", "\n\n", text)
+    text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", CODE.sub("0", text)).replace("*", "")
+    return [" ".join(part.split()) for part in re.split(r"(?<=[.?!])[)\"]?\s+|\n\s*\n", text) if part.strip()]
+
+
+def test_prose_is_found() -> None:
+    page = """# What a heading says
+
+    A *first* sentence names [what
+    it links](x.md#what) and `so many told`. Of course! "What is told"
+
+    | Whose | table |
+    - one item
+    - another
+
+    ```python
+    # Whoever
+    ```
+    """
+    sentences = _prose(inspect.cleandoc(page))
+    assert sentences == ["A first sentence names what it links and 0.", "Of course!", '"What is told"', "one item", "another"]
+    assert [part for part in sentences if OPENINGS.match(part) or DIALECT.search(QUOTED.sub("", part))] == ["Of course!"]
+
+
+@pytest.mark.parametrize("name", sorted(PAGES))
+def test_prose_of_pages_is_plain(name: str) -> None:
+    sentences = _prose((ROOT / name).read_text(encoding="utf-8"))
+    found = [part for part in sentences if OPENINGS.match(part) or DIALECT.search(QUOTED.sub("", part)) or len(WORD.findall(part)) > MOST]
+    assert found == [], "plain words: see docs/glossary.md"
+
+
+def test_the_glossary_is_in_order() -> None:
+    """One plain sentence for each word, in alphabetical order."""
+    table = re.findall(r"(?m)^\| ([^|]+) \| ([^|]+) \|$", (ROOT / "docs/glossary.md").read_text(encoding="utf-8"))[1:]
+    words = [word for word, _ in table]
+    assert words == sorted(words) and {"black box", "damage", "dose", "ensemble", "restart", "undamaged", "yoked"} <= set(words)
+    assert not [text for _, text in table if text.endswith(".") or ". " in text or len(WORD.findall(text)) > MOST or DIALECT.search(text)]
