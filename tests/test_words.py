@@ -87,6 +87,11 @@ def test_prose_is_found() -> None:
     assert [part for part in sentences if OPENINGS.match(part) or DIALECT.search(QUOTED.sub("", part))] == ["Of course!"]
 
 
+@pytest.mark.parametrize("text", ["a rule of its own.", "a law of its own that holds", "so many hours", "It stands there", "Whoever"])
+def test_the_dialect_is_found(text: str) -> None:
+    assert DIALECT.search(text) and not DIALECT.search("It hears the echo of its own probe; as many hours")
+
+
 @pytest.mark.parametrize("name", sorted(PAGES))
 def test_prose_of_pages_is_plain(name: str) -> None:
     sentences = _prose((ROOT / name).read_text(encoding="utf-8"))

@@ -22,7 +22,7 @@ Span = Annotated[tuple[Finite, Finite], Field(min_length=2, max_length=2)]
 def on_receivers(brief: Brief, attack: str, target: Array, named: bool) -> Array:
     """Return (N, w) bool: the receivers of `target`. Raise NotApplicable without one, InputError where another wire is `named`."""
     if not brief.model.air:
-        raise NotApplicable(attack, "sensors without an echo", "a plant whose sensors listen to the echo of a probe that they send")
+        raise NotApplicable(attack, "sensors without an echo", "a plant whose sensors listen to the echo of their own probe")
     reached = receivers(brief)
     for name, other in zip(brief.model.wires, np.any(target & ~reached, axis=0).tolist(), strict=True):
         if other and named:

@@ -120,7 +120,7 @@ class Challenger:
     def prepare(self, model: Model) -> ChallengePlan:
         name = f"defence {self.label}"
         if not model.air or model.agents != 1:
-            raise NotApplicable(name, list(model.sensors), "one vehicle whose sensor listens to the echo of the probe it sends")
+            raise NotApplicable(name, list(model.sensors), "one vehicle whose sensor listens to the echo of its own probe")
         predictor, reaction = self.predictor(), AcceptAll(mode=self.mode, linger=self.linger)
         return ChallengePlan(
             predictor, predictor.prepare(model), reaction, reaction.prepare(model), self.response(),

@@ -129,7 +129,7 @@ class Sensor(Protocol[P]):
 
 @runtime_checkable
 class Receiver(Sensor[P], Protocol[P]):
-    """A sensor that listens to the echo of the probe it sends, so that an attacker can reach it over the air."""
+    """A sensor that listens to the echo of its own probe, so that an attacker can reach it over the air."""
 
     @property
     def challenge(self) -> int:
