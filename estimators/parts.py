@@ -26,9 +26,9 @@ class Verdict(NamedTuple):
 class Decision(NamedTuple):
     """A mitigation's answer to a verdict.
 
-    accept (B, N, q) bool: the readings to use; mode (B, N) int8 for the controller; instead (B, N, q): readings to use in place of
-    those received; forget (B, N) bool: where the filter shall first forget how sure it was; limits (B, N, m, 2): the least and the
-    largest command that the controller may give.
+    accept (B, N, q) bool: the readings to use. mode (B, N) int8 for the controller. instead (B, N, q): readings to use in place of those
+    received. forget (B, N) bool: where the filter shall first forget how sure it was. limits (B, N, m, 2): the least and the largest
+    command that the controller may give.
     """
 
     accept: Array

@@ -1,8 +1,8 @@
 """The common part of the learners from Stable-Baselines3 and sb3-contrib: seeds, curve, checkpoints, export (extra: train).
 
-A checkpoint is one safetensors file that holds everything the next update depends on: networks, optimisers, replay buffer, memory of
-recurrent networks, environments with their episodes in flight, and random generators. An interrupted run that resumes gives the policy of
-an uninterrupted one. Reading it executes nothing.
+A checkpoint is one safetensors file that holds everything the next update depends on: networks, optimisers, replay buffer and memory of
+recurrent networks. It also holds the environments with their episodes in flight, and the random generators. An interrupted run that resumes
+gives the policy of an uninterrupted one. Reading it executes nothing.
 """
 
 from __future__ import annotations

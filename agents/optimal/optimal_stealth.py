@@ -37,8 +37,8 @@ class OptimalStealth(Script):
     """White box: makes the error along a direction e at the last step of its window as large as unnoticed injections can.
 
     Step k moves that error by e' A^(last - k) K r. The innovation is driven to the point inside of the gate that moves it farthest, away
-    from where the error is already heading. While no bound of the threat model binds this is optimal for the mean square of the error along
-    e; where one does, each step is the best one by itself. The window is one burst: all of it where the budget lasts, else its end.
+    from where the error is already heading. While no bound of the threat model binds, this is optimal for the mean square of the error
+    along e. Where one does, each step is the best one by itself. The window is one burst: all of it where the budget lasts, else its end.
     """
 
     direction: tuple[Finite, ...] = param((), "e, a number for each state; empty: in which the filter at rest can be moved farthest")

@@ -46,8 +46,8 @@ def groups(brief: Brief) -> Array:
 class BurstLoss(Timed):
     """Denial of service: messages are lost in bursts, and the receiver keeps their last values.
 
-    Each car's channel from each sender is good or bad by a Markov chain, which starts in its steady state and runs whether the window is
-    open or not. A bad spell lasts 1 / recover steps in the mean, and recover / (fail + recover) of all steps are good.
+    Each car's channel from each sender is good or bad by a Markov chain. It starts in its steady state, and runs in and out of the window.
+    A bad spell lasts 1 / recover steps in the mean, and recover / (fail + recover) of all steps are good.
     """
 
     fail: Probability = param(0.02, "probability a step that a good channel turns bad [-]")

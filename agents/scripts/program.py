@@ -41,8 +41,8 @@ class Phase:
     probability: Probability | dict[str, Probability] = param(
         1.0, "probability of a hit per step and wire: one number, or one by name for each wire [-]"
     )
-    length: PositiveCount | None = param(None, "it ends after so many attacked steps")
-    duration: PositiveCount | None = param(None, "it ends so many steps after it was armed, whatever it did")
+    length: PositiveCount | None = param(None, "number of attacked steps after which it ends")
+    duration: PositiveCount | None = param(None, "number of steps from its arming to its end, whatever it did")
 
     @property
     def ends(self) -> bool:

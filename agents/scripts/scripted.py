@@ -261,7 +261,7 @@ class InjectUniform(Script):
 @register("attack", "fdi_sparse", reference="Dutta 2018, section 4.7: y' = y + Gamma_k y_af, Gamma_k diagonal of Bernoulli variables")
 @dataclass(frozen=True)
 class InjectSparse(Script):
-    """Sparse false data injection: each sensor is hit at each step with a probability of its own, by values of a law.
+    """Sparse false data injection: each sensor has its own probability of a hit in a step; the values follow a law.
 
     `start_step` is the thesis's k_f, the step from which the probabilities hold.
     """
@@ -297,7 +297,7 @@ class InjectSparse(Script):
 @register("attack", "actuator_fdi")
 @dataclass(frozen=True)
 class InjectActuator(Script):
-    """False data injection into the command on its way to the actuator: a constant bias, of which the defence is not told."""
+    """False data injection into the command on its way to the actuator: a constant bias that the defence does not know."""
 
     value: Finite = param(1.0, "bias, cut at actuator_bound [unit of the actuator]", cut="actuator_bound")
 

@@ -1,7 +1,7 @@
 """Triggers: the times at which an attack is on, the same for scripts and for programs.
 
 A trigger is armed at the start of an episode, or in a program when the phase before has ended. From then on it fires or does not, step by
-step. One that latches opens at its first firing and stays open, another is on only while it fires; both close `window` steps after the
+step. One that latches opens at its first firing and stays open; another is on only while it fires. Both close `window` steps after the
 first firing.
 """
 
@@ -154,9 +154,9 @@ class Chance(Trigger):
 class Bursts(Trigger):
     """Random bursts of a two-state Markov chain (Gilbert 1960) with a wanted mean length and a wanted frequency or share of time.
 
-    With steps of dt, a burst of mean D [s] is left with probability dt / D a step; the pause between two, of mean 1 / f - D for f bursts
-    a second, or D (1 - s) / s for a share s, is left with dt over that mean. The first step is drawn from the chain's stationary law, so
-    that frequency and share hold on average from the beginning.
+    With steps of dt, a burst of mean D [s] is left with probability dt / D a step. The mean of the pause between two is 1 / f - D for f
+    bursts a second, or D (1 - s) / s for a share s. A pause is left with dt over that mean. The first step is drawn from the chain's
+    stationary law, so that frequency and share hold on average from the beginning.
     """
 
     duration: Positive = param(0.5, "mean length of a burst [s]")

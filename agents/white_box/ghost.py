@@ -29,8 +29,8 @@ class Ghost(NamedTuple):
 class GhostState(Script):
     """Adds C_i g to the readings of every attacked agent, where g+ = A g lives in the modes that last longest, and grows in over some time.
 
-    A linear filter follows g. One that limits what a step may change follows as fast as its limit lets it, without an end: the attack is
-    the same direction in every step. Grown in slowly it passes a gate. It ends before the threat model's bound is met.
+    A linear filter follows g. One that limits the change of a step follows as fast as its limit lets it, without an end. The attack has the
+    same direction in every step. Grown in slowly it passes a gate. It ends before the threat model's bound is met.
     """
 
     size: Positive = param(100.0, "2-norm of g when it is fully grown [unit of the state]")

@@ -219,9 +219,9 @@ class ZeroDynamics(Script):
 class Stealth(Script):
     """White box: each step moves the estimate as far along one state as the gate lets through; no attacked agent alarms in that step.
 
-    With e the direction and every sensor granted, the innovation is driven to r = s sqrt(g) S K' e / sqrt(e' K S K' e), just inside the
-    gate g; with fewer wires, to the farthest point that those reach. Among several agents each is pushed to its own gate; those that fuse
-    its belief afterwards may alarm.
+    Let e be the direction. With every sensor granted, the innovation is driven to r = s sqrt(g) S K' e / sqrt(e' K S K' e), just inside
+    the gate g. With fewer wires, it goes to the farthest point that those reach. Among several agents each is pushed to its own gate; those
+    that fuse its belief afterwards may alarm.
     """
 
     state_index: Count = param(0, "which state to push: 0 position, 1 velocity, 2 acceleration; among several cars 0 the gap, 1 the speed")

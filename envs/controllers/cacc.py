@@ -5,7 +5,7 @@ A string has a leader 0 and followers 1 .. F. Its state, shared by every plant, 
     X = [c_0 v_0 a_0 | d_1 v_1 a_1 f_1 | ... | d_F v_F a_F f_F]                                         (6.8)-(6.11)
 
 with the leader's position c_0, each follower's gap d_i to the car ahead, speeds, accelerations, and one state f_i of each controller. Every
-law is linear in X and in the V2V fields, so that the same matrices drive the cars and make the model of the closed loop:
+law is linear in X and in the V2V fields. So the same matrices drive the cars and make the model of the closed loop:
 
     u = K X + k0          tau_f f' = -f + G X + g0 + V v2v,      v2v_i = [a_{i-1}, a_0, u_{i-1}]
 """

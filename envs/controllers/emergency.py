@@ -4,7 +4,8 @@ It brakes when the gap is at most what stopping the approach takes, for some cyc
 
     gap <= margin + reaction c + c^2 / (2 decel),      c = closing speed
 
-and until the approach is over and the gap is that of `release` at the own speed again: a car that is deceived approaches at once.
+It stops braking when the approach is over and the gap is that of `release` at the own speed again. An earlier end would let a deceived
+car approach at once.
 """
 
 from dataclasses import dataclass

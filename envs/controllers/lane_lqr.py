@@ -63,7 +63,7 @@ def steady_bend(model: Model) -> tuple[float, float]:
 
 
 class LaneController:
-    """What controllers of a lane share: they remember nothing, and their gap is the distance to a line."""
+    """Base of the controllers of a lane: they remember nothing, and their gap is the distance to a line."""
 
     margin: float  # half of the lane [m]
 

@@ -21,8 +21,8 @@ class Ploeg(Law):
         tau_h u_i' = -u_i + kp e_i + kd e_i' + u_{i-1}          e_i = d_i - d_r - tau_h v_i          f_i = u_i
 
     With the message a car passes on exactly 1 / (1 + tau_h s) of its predecessor's motion. The loop on e_i, tau s^3 + s^2 + kd s + kp
-    whatever the headway, is stable for kd > kp tau. Without the message a car drives on u_i = local_kp e_i + local_kd e_i': with the gains
-    of the loop that has the message, cars that fall back amplify, and collide behind a leader that brakes.
+    whatever the headway, is stable for kd > kp tau. Without the message a car drives on u_i = local_kp e_i + local_kd e_i'. With the gains
+    of the loop that has the message, cars that fall back would amplify, and collide behind a leader that brakes.
     """
 
     error_gains: ClassVar[tuple[str, ...]] = ("kp", "local_kp")

@@ -25,12 +25,12 @@ class ActionSpec:
 
     timing: {none, attack}, the attack is `kind` with its value. mode: {none, then one per granted kind, +value and -value for fdi}, and
     fdi and echo_delay once for each of `shares`, so that an attacker chooses the size too.
-    ramp: as mode, but fdi and echo_delay have three: raise, keep or lower the value sent last by `rate`, from +-`value` or from `delay`
-    at the start of a burst. continuous: [trigger, value per wire] in [-1, 1], attack when trigger > 0, values in units of the bound.
+    ramp: as mode, but fdi and echo_delay have three: raise, keep or lower the value sent last by `rate`. A burst starts from +-`value` or
+    from `delay`. continuous: [trigger, value per wire] in [-1, 1], attack when trigger > 0, values in units of the bound.
     increment: the same, but each value is the change since the value sent last, in units of `rate`.
 
     Vectors carry the granted ones of fdi, echo_delay and noise_jam, in this order, which share (0, 1] of the trigger evenly. Both kinds
-    over the air read one more value per agent, after those of fdi: -1 is nothing and 1 the bound, an increment changes the delay alone.
+    over the air read one more value per agent, after those of fdi: -1 is nothing and 1 the bound. An increment changes the delay alone.
     """
 
     action: ActionName = param("mode", "timing, mode, ramp, continuous or increment")

@@ -172,8 +172,8 @@ class ObservationCodec:
     def _foreseen(self) -> list[Column]:
         """Return (white, one agent) how far the reading would surprise the model; of a closed loop also reading, belief, difference.
 
-        The surprise is y - C (A x + B u + c) with the value sent last on top, in the standard deviations of a step: what the defence's
-        innovation would be near, were that value sent again.
+        The surprise is y - C (A x + B u + c) with the value sent last on top, in the standard deviations of a step. The defence's
+        innovation would be near that, were the value sent again.
         """
         model, q = self.brief.model, range(len(self.brief.model.sensors))
         C = model.C[0]

@@ -128,7 +128,7 @@ class Reward:
     """Reward presets. Scores never use them: they use raw outcomes.
 
     The field `reward` names the payment of a step (the subclasses of `Payment`). The shaping terms are potential-based (Ng, Harada,
-    Russell 1999): they leave the best policy unchanged when `gamma` is the learner's, and may use the truth, which the policy does not
+    Russell 1999): they leave the best policy unchanged when `gamma` is the learner's. They may use the truth, which the policy does not
     see. Without a road nothing collides, and the potentials are 0.
     """
 

@@ -67,7 +67,7 @@ class BatchVecEnv(VecEnv):
         return [getattr(self.batch if hasattr(self.batch, attr_name) else self, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        raise AttributeError(f"{attr_name}: the rows of a batch have no attributes of their own")
+        raise AttributeError(f"{attr_name}: the rows of a batch have no separate attributes")
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
         rows: Sequence[int] = list(self._get_indices(indices))

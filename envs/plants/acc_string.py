@@ -1,11 +1,11 @@
 """A string of cars with adaptive cruise control behind a leader: no messages, each car on its own radar.
 
-Each car i has the lag tau a' + a = u (vehicle.py). What it estimates is its own
+Each car i has the lag tau a' + a = u (vehicle.py). It estimates its own
 
     x_i = [d, dv, a_ahead, v, d(k-1), dv(k-1), ..., d(k-L), dv(k-L)]
 
-with the gap d [m] to the car ahead, dv = v_ahead - v [m/s] (positive: opening), the acceleration ahead [m/s^2], the own speed [m/s] by
-trusted odometry, and what the radar saw in the L cycles that it may be late. The model of every car is that of radar_car.py:
+with the gap d [m] to the car ahead, dv = v_ahead - v [m/s] (positive: opening), the acceleration ahead [m/s^2], and the own speed [m/s]
+by trusted odometry. The rest is what the radar saw in the L cycles that it may be late. The model of every car is that of radar_car.py:
 
     d+ = d + T (dv + dv+)/2        dv+ = dv + T a_ahead - (v+ - v)        a_ahead+ = a_ahead + w        v+ = input
 
@@ -70,9 +70,9 @@ class AccString:
     lead_speed: Speed = param(20.0, "initial speed of all cars, where the manoeuvre has none [m/s]")
     noise_var: Triple = param((0.0, 0.0, 0.0), "process noise variance a step of each car's position, speed and acceleration")
     process_var: Quadruple = param(
-        (1e-6, 1e-5, 2e-2, 1e-6), "process noise variance a step that the defence is told, of d, dv, a_ahead and v"
+        (1e-6, 1e-5, 2e-2, 1e-6), "process noise variance a step that the defence assumes, of d, dv, a_ahead and v"
     )
-    prior_var: Quadruple = param((1.0, 0.25, 0.25, 1e-6), "variance that the defence is told of the prior")
+    prior_var: Quadruple = param((1.0, 0.25, 0.25, 1e-6), "variance of the prior that the defence assumes")
     aeb: Literal["own"] | None = param(None, "own: emergency braking on a second sensor that nobody attacks; none: without")
     aeb_sd: Annotated[tuple[Spread, Spread], Field(min_length=2, max_length=2)] = param(
         (0.25, 0.2), "standard deviations of that sensor's gap and closing speed [m, m/s]"

@@ -58,7 +58,7 @@ class CarFollowing:
     accel: Accel = param(0.112, "follower's initial acceleration [m/s^2]")
     process_var: Variances = param((1e-4, 4e-4, 2.5e-3), "process noise variance a step, of x, v and a [m^2, (m/s)^2, (m/s^2)^2]")
     initial_sd: Spreads = param((0.0, 0.0, 0.0), "spread of the true initial state about the prior mean [m, m/s, m/s^2]")
-    prior_var: Variances = param((1.0, 1.0, 0.25), "variance that the defence is told of the prior")
+    prior_var: Variances = param((1.0, 1.0, 0.25), "variance of the prior that the defence assumes")
     rear: bool = param(True, "a human-like driver follows behind")
     rear_reaction: Time = param(1.0, "reaction time of the driver behind [s]")
 

@@ -6,7 +6,7 @@ defence's model is the radar car's (radar_following.py), x = [d, dv, a_L, v_F]:
     d+ = d + T (dv + dv+)/2        dv+ = dv + T a_L - (v_F+ - v_F)        a_L+ = a_L + w        v_F+ = input
 
 which knows nothing of lanes: where somebody cuts in, or the car ahead leaves the lane, d and dv jump. The car's command goes through the
-lag tau a' + a = a_des (vehicle.py); its speed is exact, and the scene moves it with the speed at the beginning of the step.
+lag tau a' + a = a_des (vehicle.py). Its speed is exact, and the scene moves it with the speed at the beginning of the step.
 """
 
 from __future__ import annotations
@@ -74,7 +74,8 @@ class HighwayState(NamedTuple):
 class Highway:
     """An ACC car that keeps its lane on a road with traffic, sees the car ahead by radar and knows its own motion.
 
-    Ahead is whoever has a part of his car in the lane. Nobody, or nobody nearer than `reach`, is a car at `reach` that keeps the own speed.
+    The car ahead is the next one with a part of it in the lane. If there is none nearer than `reach`, it is a car at `reach` that keeps
+    the own speed.
     """
 
     dt: Step = param(0.1, "step [s]")
@@ -96,9 +97,9 @@ class Highway:
     cut_in: Span | None = param(None, "time between cut-ins in front of the car, uniform on this span [s]; none: only MOBIL's")
     cut_gap: Gaps = param((12.0, 30.0), "gap at which a car cuts in [m]")
     process_var: Quadruple = param(
-        (3e-3, 1e-1, 3.0, 1e-6), "process noise variance a step that the defence is told, of d, dv, a_L and v_F; the plant has none"
+        (3e-3, 1e-1, 3.0, 1e-6), "process noise variance a step that the defence assumes, of d, dv, a_L and v_F; the plant has none"
     )
-    prior_var: Quadruple = param((1.0, 1.0, 0.25, 1e-6), "variance that the defence is told of the prior")
+    prior_var: Quadruple = param((1.0, 1.0, 0.25, 1e-6), "variance of the prior that the defence assumes")
 
     def __post_init__(self) -> None:
         if self.lane >= self.lanes:

@@ -1,7 +1,7 @@
 """A road scene of HighwayEnv (Leurent 2018) as a function: the numbers of all its cars in, one step, their numbers out.
 
-Traffic follows the Intelligent Driver Model and changes lanes by MOBIL. The objects of HighwayEnv are a workbench: every step puts all that
-they remember into them and takes it out again, so that nothing of one episode reaches another. The first car is the one with the
+Traffic follows the Intelligent Driver Model and changes lanes by MOBIL. Every step puts all that the objects of
+HighwayEnv remember into them and takes it out again, so that nothing of one episode reaches another. The first car is the one with the
 controller; the scene steers it along its lane and accelerates it by the given command.
 """
 

@@ -2,9 +2,9 @@
 
     x = [e_y m, e_y' m/s, e_psi rad, e_psi' rad/s],     x' = A x + B1 delta + B2 v kappa
 
-with the offset e_y of the centre of gravity from the middle of the lane (left is positive), the heading error e_psi against the road,
-the steering angle delta [rad] and the curvature kappa [1/m] (a left bend is positive). C_f, C_r are of one tyre, two to an axle.
-The step is exact for inputs that are held over it. A steady bend has
+with the offset e_y of the centre of gravity from the middle of the lane (left is positive) and the heading error e_psi against the road.
+The inputs are the steering angle delta [rad] and the curvature kappa [1/m] (a left bend is positive). C_f, C_r are of one tyre, two to an
+axle. The step is exact for inputs that are held over it. A steady bend has
 
     e_psi = (-l_r + l_f m v^2 / (2 C_r L)) kappa,     delta = (L + (m v^2 / L) (l_r / (2 C_f) - l_f / (2 C_r))) kappa
 
@@ -109,7 +109,7 @@ class LaneKeeping:
         (1e-6, 1e-3, 1e-8, 4e-5), "process noise variance a step, of e_y, e_y', e_psi, e_psi' [m^2, (m/s)^2, rad^2, (rad/s)^2]"
     )
     initial_sd: Spreads = param((0.1, 0.0, 0.005, 0.0), "spread of the true initial state about 0 [m, m/s, rad, rad/s]")
-    prior_var: Variances = param((0.04, 0.01, 1e-4, 1e-4), "variance that the defence is told of the prior")
+    prior_var: Variances = param((0.04, 0.01, 1e-4, 1e-4), "variance of the prior that the defence assumes")
 
     def __post_init__(self) -> None:
         if self.half_lane <= SIGMAS * self.initial_sd[0]:

@@ -6,8 +6,8 @@ State and laws are those of cacc.py. No car knows the others' commands, so that 
 
     X' = Ac X + cc + Br u_r,      discretised by zero-order hold: X+ = Ad X + cd + Bd u_r
 
-with the leader's input u_r. (The open loop, as the thesis prints it, has an integrator in every gap that only its own car can see: it is
-refused as undetectable.) `platoon` drives cars, which have limits and do not roll back, on the estimates; `platoon_linear` is the thesis's
+with the leader's input u_r. (The open loop, as the thesis prints it, has an integrator in every gap that only its own car can see. It is
+refused as undetectable.) `platoon` drives cars, which have limits and do not roll back, on the estimates. `platoon_linear` is the thesis's
 simulation, the linear closed loop on the true state. Erratum: the leader's fourth, all-zero state in (6.10) cannot be detected, and is
 dropped.
 """
@@ -87,7 +87,7 @@ class String:
 
     followers: Followers = param(4, "cars behind the leader")
     topology: Topology = param("predecessor_leader", "who hears whom; predecessor_leader is the thesis's")
-    leader_input_known: bool = param(False, "the followers are told the leader's command")
+    leader_input_known: bool = param(False, "the followers know the leader's command")
     dt: Step = param(0.1, "step [s]")
     tau: Lag = param(1.008, "actuator lag [s]")
     gap: Gap = param(65.0, "mean initial gap [m]")
@@ -95,11 +95,11 @@ class String:
     gap_range: Length = param(2.0, "uniform spread of the initial gaps, to either side [m]")
     speed: Speed = param(20.0, "initial speed of all cars [m/s]")
     process_var: PositiveVariance = param(
-        1e-3, "process noise variance a step that the defence is told, of all states but the accelerations"
+        1e-3, "process noise variance a step that the defence assumes, of all states but the accelerations"
     )
-    accel_sd: PositiveSpread = param(0.397, "standard deviation a step that it is told of the accelerations: what it does not know [m/s^2]")
-    initial_sd: Spread = param(0.1, "spread of what each car is told of the initial state, about the truth")
-    prior_var: PositiveVariance = param(0.01, "variance that it is told of that")
+    accel_sd: PositiveSpread = param(0.397, "standard deviation a step that it assumes of the accelerations: what it does not know [m/s^2]")
+    initial_sd: Spread = param(0.1, "spread of each car's prior mean about the true initial state")
+    prior_var: PositiveVariance = param(0.01, "variance of that prior, as the defence assumes it")
 
     def __post_init__(self) -> None:
         least = self.gap_range + SIGMAS * self.gap_sd
@@ -253,7 +253,7 @@ class PlatoonSensors:
     """Each car's gap to the one ahead (the leader's position), speed and acceleration."""
 
     noise_sd: Spreads = param((0.1, 0.1, 0.05), "standard deviations of the sensors' noise [m, m/s, m/s^2]")
-    told_sd: Spreads | None = param(None, "the same as the defence is told (Sigma_v); none: the true ones")
+    told_sd: Spreads | None = param(None, "the same as the defence assumes them (Sigma_v); none: the true ones")
 
     def matrices(self, plant: Sized) -> tuple[tuple[str, ...], Array, Array]:
         if not isinstance(plant, String):

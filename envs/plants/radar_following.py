@@ -4,8 +4,8 @@
     a_F+ = alpha a_F + (1 - alpha) KL a_des        v_F+ = max(0, v_F + a_F+ T)        x+ = x + (v + v+) T/2        (3.14)
     v_L+ = max(0, v_L + a_L T)                                                                                    (3.15)-(3.17)
 
-What a defence estimates is x = [d, dv, a_L, v_F]: gap [m], dv = v_L - v_F (positive: opening) [m/s], the leader's acceleration [m/s^2]
-and the own speed [m/s], which trusted odometry gives as the model's known input:
+A defence estimates x = [d, dv, a_L, v_F]: gap [m], dv = v_L - v_F (positive: opening) [m/s], the leader's acceleration [m/s^2] and the
+own speed [m/s]. Trusted odometry gives the own speed as the model's known input:
 
     d+ = d + T (dv + dv+)/2        dv+ = dv + T a_L - (v_F+ - v_F)        a_L+ = a_L + w        v_F+ = input
 """
@@ -61,9 +61,9 @@ class RadarFollowing:
     lead_speed: Speed = param(29.0576, "leader's initial speed [m/s]; 65 mph")
     speed: Speed = param(29.95168, "follower's initial speed [m/s]; 67 mph")
     process_var: Quadruple = param(
-        (1e-3, 1e-3, 1e-5, 1e-6), "process noise variance a step that the defence is told, of d, dv, a_L and v_F; the plant has none"
+        (1e-3, 1e-3, 1e-5, 1e-6), "process noise variance a step that the defence assumes, of d, dv, a_L and v_F; the plant has none"
     )
-    prior_var: Quadruple = param((1.0, 1.0, 0.25, 1e-6), "variance that the defence is told of the prior")
+    prior_var: Quadruple = param((1.0, 1.0, 0.25, 1e-6), "variance of the prior that the defence assumes")
     rear: bool = param(False, "a human-like driver follows behind")
     rear_reaction: Time = param(1.0, "reaction time of the driver behind [s]")
 

@@ -103,7 +103,7 @@ class ScalarLoop:
 class ExactReading:
     """y = x, the state of a scalar loop without noise."""
 
-    told_var: PositiveVariance = param(1.0, "noise variance that a filter is told")
+    told_var: PositiveVariance = param(1.0, "noise variance that a filter assumes")
 
     def matrices(self, plant: Sized) -> tuple[tuple[str, ...], Array, Array]:
         if not isinstance(plant, ScalarLoop):

@@ -95,9 +95,9 @@ class SensorNetwork:
     system_seed: Count = param(0, "seed of A and of a random graph")
     dt: Step = param(1.0, "step [s]; the thesis has none")
     noise_var: Variance = param(0.0, "process noise variance of the system itself; 0, as in the thesis, is none")
-    process_var: PositiveVariance = param(1.0, "process noise variance that the defence is told (Sigma_w)")
+    process_var: PositiveVariance = param(1.0, "process noise variance that the defence assumes (Sigma_w)")
     initial_sd: Spread = param(1.0, "spread of the true initial state about 0, which the defence takes it for")
-    prior_var: PositiveVariance = param(1.0, "variance that the defence is told of the prior")
+    prior_var: PositiveVariance = param(1.0, "variance of the prior that the defence assumes")
 
     def __post_init__(self) -> None:
         if self.agents * self.states * self.states > MOST:
@@ -211,7 +211,7 @@ class LinearSensors:
     modes_seen: PositiveCount = param(1, "pattern modes: how many of the system's modes each agent sees")
     sensor_seed: Count = param(0, "seed of the C_i")
     noise_var: Variance = param(0.0, "variance of the sensors' noise; 0, as in the thesis, is none")
-    told_var: PositiveVariance = param(1.0, "noise variance that the defence is told (Sigma_v)")
+    told_var: PositiveVariance = param(1.0, "noise variance that the defence assumes (Sigma_v)")
 
     def matrices(self, plant: Sized) -> tuple[tuple[str, ...], Array, Array]:
         where = "sensor linear_sensors"

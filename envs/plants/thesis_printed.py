@@ -25,7 +25,7 @@ from tailgate.envs.plants.car_following import CarFollowing, FollowingPlan
 @register("plant", "car_following_literal", reference="Dutta 2018, section 4.6.1 and (4.16), as printed")
 @dataclass(frozen=True)
 class CarFollowingLiteral(CarFollowing):
-    """The thesis's matrices as printed. The public model has A_d: the filter is not told when the car accelerates."""
+    """The thesis's matrices as printed. The public model has A_d: the filter does not know when the car accelerates."""
 
     headway: Headway = param(3.0, "time headway h [s]")
     gamma: PositiveGain = param(0.9, "gap gain [1/s]")

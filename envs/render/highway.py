@@ -185,7 +185,7 @@ def _crosses(tie: Box | None, cars: list[Box]) -> bool:
 
 
 def _name(sheet: Sheet, places: Places, stage: Stage, car: Car) -> None:
-    """Draw name and speed below a car, or wherever around it there is room; with a line to it if that is not next to it."""
+    """Draw name and speed below a car, or around it where there is room; add a line if that is not next to the car."""
     if not (car.name or car.doing) or not 0.0 <= sheet.column(car.x) <= sheet.width:
         return
     seat, one, others = sheet.seat(car).grown(RIM + 2.0), stage.lanes == 1, [sheet.seat(other) for other in stage.cars if other is not car]

@@ -1,7 +1,7 @@
-"""The picture of a car that keeps its lane, from above (extra: viz): the car where it is, and as a dashed outline where it believes it is.
+"""The picture of a car that keeps its lane, from above (extra: viz): the car, and a dashed outline where it believes it is.
 
 The road bends ahead by its curvature now. Across the lane and along it are to scale, each to its own.
-What is believed belongs to the measurement, a step before the road that is shown: the outline is off by the error of that time.
+The belief belongs to the measurement, a step before the road that is shown: the outline is off by the error of that time.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The picture of a car that sees the one ahead by radar (extra: viz): the road, the belief, the probe and what is heard.
 
-What is believed belongs to the measurement, a step before the road that is shown: the ghost is off by the error of that time, and the
-words give both gaps of that time.
+The belief belongs to the measurement, a step before the road that is shown. The ghost is off by the error of that time, and the words
+give both gaps of that time.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """HighwayEnv's drawing of a road and the cars on it, as pixels (extras: highway, viz).
 
-RoadGraphics and VehicleGraphics are what HighwayEnv's own viewer draws with. The viewer itself (EnvViewer) belongs to an environment of
-HighwayEnv, opens the display, and draws nothing under a dummy video driver: here it is replaced by a surface in memory.
+HighwayEnv's own viewer draws with RoadGraphics and VehicleGraphics. The viewer itself (EnvViewer) belongs to an environment of
+HighwayEnv, opens the display, and draws nothing under a dummy video driver. Here a surface in memory replaces it.
 """
 
 from __future__ import annotations

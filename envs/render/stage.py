@@ -1,6 +1,6 @@
 """The cars on the road, and each defence's belief of them, as plain numbers: the content of a picture on HighwayEnv's road.
 
-The error of a belief is that of the measurement's time and is put on the road as it is now: `believed` is the true gap plus that error.
+A belief's error is that of the measurement's time, put on the road as it is now: `believed` is the true gap plus that error.
 """
 
 from __future__ import annotations

@@ -254,7 +254,7 @@ def heard_energy(samples: int, heard: Array, jam: Array, tone: Array, z: Array) 
 def mean_power(samples: int, heard: Array, jam: Array, tone: Array, z0: Array, z1: Array, z2: Array) -> Array:
     """Return what `heard_energy` returns, elementwise.
 
-    The tone adds to that part of the noise that is in phase with it, one normal; the other 2 N_c - 1 are two gamma variables by Wilson and
+    The tone adds to the part of the noise that is in phase with it, one normal. The other 2 N_c - 1 are two gamma variables by Wilson and
     Hilferty's cube (1931).
     """
     noise, rest = 1.0 + jam, samples - heard

@@ -1,7 +1,7 @@
 """The FMCW radar at the level of its signal: a chirp, its delayed echo, complex IF samples, and root-MUSIC on them.
 
-Nothing here knows the beat frequencies in closed form: a sweep is transmit x conj(delayed echo), sample by sample, with the receiver's
-noise, and what is read comes out of the samples. The closed-form path of the sensor is held to this one by a test.
+Nothing here knows the beat frequencies in closed form. A sweep is transmit x conj(delayed echo), sample by sample, with the receiver's
+noise, and the readings come out of the samples. The closed-form path of the sensor is held to this one by a test.
 
 Root-MUSIC of one tone in M samples (Barabell 1983; Stoica and Moses, *Spectral Analysis of Signals*, 2005, section 4.5). With windows
 w_k = (x_k, ..., x_{k+m-1})', a(z) = (1, z, ..., z^{m-1})' and J the exchange matrix,
@@ -10,8 +10,8 @@ w_k = (x_k, ..., x_{k+m-1})', a(z) = (1, z, ..., z^{m-1})' and J the exchange ma
     D(z) = a(1/z)' (I - s s*) a(z)                     s the first eigenvector of R, I - s s* the noise subspace
 
 and the frequency is the angle of the root of D next to the unit circle. R is centro-Hermitian, so that a unitary matrix turns it into a
-real one (Pesavento, Gershman and Haardt 2000): s is found there by power iteration. The root is found from the deepest point of D on the
-circle by Cauchy's method, which solves a quadratic in each step and so meets the pair of roots z, 1/z^c of a strong tone.
+real one (Pesavento, Gershman and Haardt 2000): s is found there by power iteration. Cauchy's method finds the root, from the deepest point
+of D on the circle. It solves a quadratic in each step and so meets the pair of roots z, 1/z^c of a strong tone.
 
 Sums run in an order that the number of rows does not change, and sines are the engine's. So a row's result depends neither on its
 companions nor on the machine's mathematical library.
@@ -44,8 +44,8 @@ def read(link: Link, d: Array, dv: Array, late: Array, snr: Array, noise: Array,
 
     d [m] and dv [m/s] of the target between the sweeps, the attacker's delay `late` as range [m], snr (echo over the receiver's noise) and
     noise (all noise over the receiver's): (B, N). normals (B, N, 2, M, 2): real and imaginary parts of the noise of the two sweeps.
-    From the middle of one sweep to that of the other the target moves by dv Ts, which (3.8) reads as a speed of -dv Bs lam/(2 c): the
-    receiver takes that out.
+    From the middle of one sweep to that of the other the target moves by dv Ts. (3.8) reads that as a speed of -dv Bs lam/(2 c), which
+    the receiver takes out.
     """
     beats, low, sides = np.empty((*d.shape, 2)), link.lowest / link.bandwidth, np.array([1.0, -1.0])
     for part in _parts(beats.size):

@@ -34,7 +34,7 @@ Step = tuple[Tensor, Tensor, Tensor, Tensor, Tensors]
 class TensorVecEnv:
     """`num_envs` environments of `AdversaryVectorEnv` with its arguments, values, seeds and autoreset; tensors in place of arrays.
 
-    Results are never written again: whoever keeps them keeps their values. id: whose defaults hold for what `arguments` leaves open.
+    Results are never overwritten: results that are kept keep their values. id: its defaults hold for what `arguments` leaves open.
     """
 
     def __init__(self, num_envs: int, id: str = CAR_FOLLOWING, *, device: str | None = None, **arguments: Any) -> None:

@@ -8,8 +8,8 @@ A sensor that mutes its own probe hears noise alone; an answer then comes from a
 and the controller drives on the prediction. While alarmed no reading is used. Both beliefs, the live one and the safe one, are predicted
 with the known input in every step, which is the replay.
 
-The energy of N complex samples of noise, over their expected one, is Gamma(N, 1/N): threshold = its upper quantile at the probability of
-a false alarm a challenge.
+The energy of N complex samples of noise, over their expected one, is Gamma(N, 1/N). The threshold is its upper quantile at the probability
+of a false alarm a challenge.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A defence whose knobs are turned while it runs: by a trained policy, by a fixed hand, or from outside (docs/two-players.md).
 
-A trained defender is a small tanh perceptron over `Sight` whose largest output names the setting of the knobs that holds for the next
-`interval` steps. It is a JSON file and a safetensors file; loading them executes nothing. Played through `steered` it is a defence like
+A trained defender is a small tanh perceptron over `Sight`. Its largest output names the setting of the knobs for the next `interval`
+steps. It is a JSON file and a safetensors file; loading them executes nothing. Played through `steered` it is a defence like
 any other: every evaluation, learner and page takes it.
 """
 
@@ -100,7 +100,7 @@ def _imports(data: object) -> bool:
 @register("defence", "steered", uses=("measurements", "v2v"), reference="docs/two-players.md")
 @dataclass(frozen=True, kw_only=True)
 class Steered:
-    """A filter with a detector whose threshold and reaction are set anew every few steps, by a trained policy or by hand."""
+    """A filter with a detector whose threshold and reaction are set again every few steps, by a trained policy or by hand."""
 
     uses: ClassVar[tuple[str, ...]] = ("measurements", "v2v")
 
@@ -235,7 +235,7 @@ class Steered:
 @register("defence", "steered_cra", uses=("measurements", "odometry", "probe"), reference="docs/two-players.md")
 @dataclass(frozen=True, kw_only=True)
 class SteeredChallenge(Steered):
-    """Challenge-response authentication whose challenges and reaction are set anew every few steps, by a trained policy or by hand."""
+    """Challenge-response authentication whose challenges and reaction are set again every few steps, by a trained policy or by hand."""
 
     uses: ClassVar[tuple[str, ...]] = ("measurements", "odometry", "probe")
 

@@ -1,7 +1,7 @@
 """The knobs of a defence, which are parameters that change while it runs, in each row separately; and the view of who turns them.
 
-A knob is a parameter of an unchanged defence: the alarm threshold, the probability of a challenge, or the mode that the controller is asked
-for while alarmed. Turning a knob replaces the parameter by an array with one value per row. The parameter enters elementwise comparisons
+A knob is a parameter of an unchanged defence: the alarm threshold, the probability of a challenge, or the controller's mode while alarmed.
+Turning a knob replaces the parameter by an array with one value per row. The parameter enters elementwise comparisons
 only; a knob at the defence's own value changes no bit.
 
 The player who turns the knobs sees only what the defence has: score, alarms, residuals, estimate, message and odometry.

@@ -29,8 +29,8 @@ INSIDE = 1.0 - 1e-12  # factor on a bound: the rounding of square roots must not
 def whiten(innovation: Innovation) -> Array:
     """Return L^-1 r (B, N, q) with the Cholesky factor L of S: uncorrelated, of unit variance, and of length r' S^-1 r.
 
-    Which square root of S is taken turns the result and changes no length, but over time-varying S the sum of turned ones; S settles
-    within seconds.
+    Another square root of S turns the result and changes no length. Over a time-varying S it changes the length of a sum of results; S
+    settles within seconds.
     """
     r, S = innovation
     q = r.shape[-1]

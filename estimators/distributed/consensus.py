@@ -6,10 +6,10 @@
 
 Each agent is a Kalman filter on its own sensors. It pulls its estimate towards the predictions of its neighbours, the harder the less it
 knows; the covariance ignores that. With `share` the neighbours send their readings too (the paper's second algorithm), and K_i
-uses them as if they were the agent's own; an agent sends what its own gate let pass.
+uses them like the agent's own. An agent sends the readings that passed its gate.
 
-Two things differ from the paper. The sum over the neighbours is their mean, so that one gain suits every graph: for a gain up to 1 the pull
-alone is then a contraction. The gain is called `consensus`, not eps.
+Two things differ from the paper. The sum over the neighbours is their mean. So one gain suits every graph: for a gain up to 1 the pull
+alone is a contraction. The gain is called `consensus`, not eps.
 
 An agent that cannot see a mode by itself has a covariance that grows with it, linearly where the mode lasts. The pull then works on just
 this mode. Where such a mode grows the covariance overflows in time: NotApplicable.

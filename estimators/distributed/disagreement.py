@@ -7,7 +7,7 @@ against its own estimate (nodal). An input that fails is left out. Here, on the 
     neighbour j       left out of N(i) where  z_ij = max_k |xb_j,k - c_i,k| / sqrt(M_i,kk + M_j,kk)  > threshold
 
 Agent j sends xb_j with its covariance M_j = A P_j A' + Sw. c_i is the own prediction of i, or the median, state by state, of it and all
-that i hears; with the median an agent can also find that it is wrong itself. Two agents have no majority. An agent without neighbours left
+that i hears. With the median an agent can also find that it is wrong itself. Two agents have no majority. An agent without neighbours left
 keeps its own prediction. Errors of neighbours are correlated, so that z is smaller than for independent ones: the threshold, in sigma, is
 conservative.
 """

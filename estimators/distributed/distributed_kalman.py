@@ -9,7 +9,7 @@ N(i) = {i} + in-neighbours, d_i = |N(i)|. What arrives from the neighbours, xb_i
 prediction of a Kalman filter: innovation, gain and update are that filter's (kalman.py). Erratum: the sum in (5.5) runs over j with P_j.
 
 Steady filters hold P_i at the fixed point of (5.5). With all L_j but its own, a node's equation is that of a Kalman filter with sqrt(d_i) A
-and d_i Sw; it is solved by doubling, node after node, until nothing moves, and the result is washed with (5.5) itself.
+and d_i Sw. It is solved by doubling, node after node, until nothing moves. Then (5.5) itself is iterated on the result.
 """
 
 from __future__ import annotations
@@ -339,7 +339,7 @@ class GatedDistributedKalman(Composed):
     """Distributed Kalman filter in which an agent ignores its own readings where r' S^-1 r exceeds eta.
 
     With the varying gain an agent whose gate is shut knows that it knows less: its gate widens, and its neighbours weigh it less. With the
-    steady gain neither holds, and a manoeuvre that nobody was told of can lock the gate for good.
+    steady gain neither holds, and a manoeuvre that nobody knew of can lock the gate for good.
     """
 
     threshold_field: ClassVar[str] = "eta"

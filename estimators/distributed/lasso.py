@@ -2,8 +2,8 @@
 
     xh_i = argmin_{X, a}  (y_i - C_i X - a)' Sv_i^-1 (y_i - C_i X - a) + lam |a|_1 + (X - xb_i)' Q_i (X - xb_i)        (6.26)
 
-xb_i and Q_i^-1 are what the neighbours' predictions fuse to (distributed.py). With S = Sv + C Q^-1 C' and r = y - C xb, the best X for a
-given a is the linear update of r - a, and what is left is the robust Kalman filter's problem (robust.py),
+The neighbours' predictions fuse to xb_i and Q_i^-1 (distributed.py). Put S = Sv + C Q^-1 C' and r = y - C xb. For a given a, the best X is
+the linear update of r - a. The robust Kalman filter's problem (robust.py) remains,
 
     a = argmin (r - a)' S^-1 (r - a) + lam |a|_1,      p = S^-1 (r - a),  |p_l| <= lam/2,      xh = xb + Q^-1 C' p
 
@@ -12,7 +12,7 @@ problem.
 
 Price: lam is in 1/unit of the sensor, one number for all sensors, as in (6.26): a reading off by less than lam Sv / 2 counts as noise. A
 small one is resilient, and slow to follow what the model does not foresee. The default 5 was tuned on platoon-braking, where it cuts at a
-quarter of a standard deviation of the gap's noise: most honest readings pay a little. The thesis's own case, whose filter expects a
+quarter of a standard deviation of the gap's noise. There most honest readings pay a little. The thesis's own case, whose filter expects a
 noise of 1, has 0.1. With 0.1 the braking platoon cannot follow its brakes: half of the runs without any attack collide.
 """
 

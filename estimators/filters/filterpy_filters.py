@@ -106,7 +106,7 @@ def root(P: Array) -> Array:
 class HInfinityAdapter(KalmanAdapter):
     """The a-posteriori H-infinity filter on the measurement update of filterpy.hinfinity.HInfinityFilter.
 
-    filterpy's class warns that it is likely wrong: it scales the correction by F once too often, predicts no covariance, and its gain is
+    filterpy's class warns that it is likely wrong: it scales the correction by F once too often, and predicts no covariance. Its gain is
     the one-step predictor's, which overshoots where P-^-1 > gamma C'R^-1 C fails. So its update is used with F = I and W = 0, with gamma
     for the covariance and without for the gain. The prediction is made here (Hassibi, Sayed and Kailath 1996):
 

@@ -4,9 +4,9 @@
     r = y - C x-                S = C P- C' + R          K = P- C' S^-1                                 (4.6)
     x = x- + K r                P = P- - K S K'                                                        (4.7)
 
-A sensor that is not accepted has its row of C, and its covariances in S, set to zero: no sensor at all gives x = x-, P = P-.
+For a sensor that is not accepted, its row of C and its covariances in S are zero. No sensor at all gives x = x-, P = P-.
 
-The steady filter holds P- at the solution of P- = A (P- - K S K') A' + Q. Its gain is constant for each set of sensors: where some are
+The steady filter holds P- at the solution of P- = A (P- - K S K') A' + Q. Its gain is constant for each set of sensors. Where some are
 left out, the others correct with the gain that they have alone at the same P-. Missing readings do not widen its S.
 """
 

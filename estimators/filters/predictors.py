@@ -1,7 +1,7 @@
 """Predictors that know no motion: each reading is extrapolated from its own past. They are baselines.
 
     hold_last          y(k) = the last reading
-    autoregressive     y(k) = w1 y(k-1) + ... + wp y(k-p), w by least squares; a prediction stands in for a missing one
+    autoregressive     y(k) = w1 y(k-1) + ... + wp y(k-p), w by least squares; a prediction replaces a missing one
     polynomial         y(k) = the polynomial that fits the last W readings best, at k
 
 A state that a sensor reads equals the reading where that is used, else the prediction. A state that the known input alone decides, such as

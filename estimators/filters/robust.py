@@ -79,9 +79,9 @@ def _within(x: Array, low: Array, high: Array) -> Array:
 def _pivot(r: Array, W: Array, half: Array, size: Array) -> Array:
     """Solve for any number of sensors: block principal pivoting (Judice and Pires 1992), which ends in a finite number of rounds.
 
-    A round solves for the outliers of presumed signs, and changes the presumptions that its solution contradicts: all of them while they
-    grow fewer, else the last one alone. (Coordinate descent is simpler, and takes thousands of sweeps where sensors are correlated.)
-    r, half and size (B, N, q), W (B, N, q, q).
+    A round solves for the outliers of presumed signs, and changes the presumptions that its solution contradicts. It changes all of them
+    while they grow fewer, else the last one alone. (Coordinate descent is simpler, and takes thousands of sweeps where sensors are
+    correlated.) r, half and size (B, N, q), W (B, N, q, q).
     """
     q = r.shape[-1]
     sensors = range(q)

@@ -217,17 +217,19 @@ class InputClip(OwnSensors):
 
         bound = (d_r - clearance - noise - slack) / width
 
-    `width`: half-width along the gap of the ellipsoid that holds every state reached by a deviation of at most 1 m/s^2; `noise`: the most
-    that noise within `sigmas` standard deviations does; `slack`: what a car ahead with any speed in [0, speed_max] can take of d_r, nothing
-    where the gap's response to it is nowhere negative. The bound holds always, alarmed or not. A command below the own law's only widens
-    the gap, so that no bound is needed there; one on both sides, as in the paper, also follows false readings of the own sensors upwards.
-    Assumptions: docs/platoon.md.
+    `width`: half-width along the gap of the ellipsoid that holds every state reached by a deviation of at most 1 m/s^2.
+    `noise`: the most that noise within `sigmas` standard deviations does.
+    `slack`: the most that a car ahead with any speed in [0, speed_max] can take of d_r. It is 0 where the gap's response to that speed is
+    nowhere negative.
+
+    The bound holds always, alarmed or not. A command below the own law's only widens the gap, so that no bound is needed there. A bound
+    on both sides, as in the paper, also follows false readings of the own sensors upwards. Assumptions: docs/platoon.md.
     """
 
     kp: Positive = param(0.5, "gain of the spacing error of the own law [1/s^2]")
     kd: NonNegative = param(1.0, "gain of its rate [1/s]")
     clearance: NonNegative = param(0.5, "gap that is always kept [m]")
-    sigmas: NonNegative = param(3.0, "the own sensors' noise is at most so many standard deviations [-]")
+    sigmas: NonNegative = param(3.0, "bound of the own sensors' noise, in standard deviations [-]")
     speed_max: Positive = param(40.0, "highest speed of the car ahead [m/s]")
     sides: Literal["above", "both"] = param("above", "above: the command is bounded from above only; both: on both sides of the own law's")
 
@@ -286,8 +288,8 @@ class SlidingMode(OwnSensors):
         e = d - d_r - tau_h v          sigma = e' + lam e,   e' = s - tau_h a
         u = a + (tau / tau_h) (-a + lam e' + eta sat(sigma / phi))      so that      sigma' = a_{i-1} - eta sat(sigma / phi)
 
-    Behind any car whose |acceleration| stays below eta, |sigma| <= phi holds once reached, but for what s lags behind (at most T eta); e
-    then follows with the time constant 1 / lam.
+    Behind any car whose |acceleration| stays below eta, |sigma| <= phi holds once reached, but for the lag of s (at most T eta). Then e
+    follows with the time constant 1 / lam.
     """
 
     lam: Positive = param(0.5, "rate at which the spacing error dies out on the surface [1/s]")

@@ -2,8 +2,8 @@
 
     u = u_controller + du,       du ~ N(0, Qu) iid, from the defence's own random numbers
 
-The filter knows du, as it is part of the command. A replayed reading answers another du, so that under replay, for the loop of the Kalman
-filter with gain K and the feedback u = L xh, with calA = (A + B L)(I - K C) stable, E r' S^-1 r rises from q to
+The filter knows du, as it is part of the command. A replayed reading answers another du. Take the loop of the Kalman filter with gain K and
+the feedback u = L xh, with calA = (A + B L)(I - K C) stable. Under replay E r' S^-1 r rises from q to
 
     q + 2 tr(C' S^-1 C U),        U = calA U calA' + B Qu B'
 

@@ -26,7 +26,7 @@ class RejectAttacked(Stateless):
 @register("defence", "oracle", uses=("measurements", "truth"))
 @dataclass(frozen=True)
 class Oracle(Composed):
-    """Kalman filter that is told which measurements are attacked and ignores those."""
+    """Kalman filter that knows which measurements are attacked and ignores those."""
 
     def parts(self) -> tuple[Filter, Detector, Mitigation]:
         return KalmanFilter(), Score(), RejectAttacked()
@@ -35,7 +35,7 @@ class Oracle(Composed):
 @register("defence", "dkf_oracle", uses=("measurements", "truth"), reference="Dutta 2018, (6.19)-(6.25)")
 @dataclass(frozen=True)
 class DistributedOracle(Composed):
-    """Distributed Kalman filter in which every agent is told which of its readings are attacked and ignores those."""
+    """Distributed Kalman filter in which every agent knows which of its readings are attacked and ignores those."""
 
     gain: Gain = param("varying", GAIN)
 

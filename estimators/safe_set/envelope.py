@@ -1,7 +1,7 @@
 """The safety envelope of learned invariants: bounds that clean runs never left (docs/detectors.md#the-learned-envelope).
 
-An invariant bounds a weighted sum g of the signals of one agent: its readings y and messages m in this step, the same in the step before,
-and the known input u. The bounds depend on the sign of u where the clean runs gave tighter ones for it.
+An invariant bounds a weighted sum g of one agent's signals. These are its readings y and messages m in this step and the step before, and
+the known input u. The bounds depend on the sign of u where the clean runs gave tighter ones for it.
 
     g = a' [y, m, y-, m-, u]        s = max |g - middle| / half width, over the invariants whose signals all arrived
 

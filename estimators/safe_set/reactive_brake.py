@@ -6,8 +6,8 @@ up. This is the distance of responsibility-sensitive safety (RSS), with the actu
 
     d < clearance + v rho + a' rho^2 / 2 + stop(v + a' rho, a') - w^2 / (2 b_lead)
 
-It does so while a reading is distrusted or missing, and for `watch` seconds after. A car that was slowed down has a large gap: its
-controller accelerates to close it while the car ahead may stop, and may be unsafe by itself.
+It does so while a reading is distrusted or missing, and for `watch` seconds after. A car that was slowed down has a large gap. Its
+controller, which may be unsafe by itself, accelerates to close it while the car ahead may stop.
 
 stop(v, a) is the way to a standstill through a first-order lag tau under the constant command -b, with c = a + b:
 

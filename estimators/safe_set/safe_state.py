@@ -1,13 +1,13 @@
 """Set-membership safe states: an interval that holds each quantity, whatever bounded noise and disturbances do (docs/safe-state.md).
 
-For each car a box of gap d, speed w of the car ahead, own speed v and own acceleration a. In each step the dynamics move it, and then every
-reading y, accurate to e, is tested on its own against the box P that was predicted:
+For each car a box of gap d, speed w of the car ahead, own speed v and own acceleration a. In each step the dynamics move it. Then every
+reading y, accurate to e, is tested by itself against the box P that was predicted:
 
     w+ in w + [a_min, a_max] dt        d+ in d + (w + w+) dt / 2 - s        |y - mid P| <= e + half P, else an attack
 
 s is the way of the own car in the step: its exact average speed, times dt. With the speed at the end of the step, the box would lose the
 truth whenever the car brakes. A reading that passes is intersected with P. After one that fails, the sensor's readings are ignored
-until `recover` seconds of them passed in a row; meanwhile the box grows as the dynamics allow.
+until they passed for `recover` seconds in a row. Meanwhile the box grows as the dynamics allow.
 
 Where no message gives w, the gaps do. With h_j = d - j dt w,
 
@@ -76,7 +76,7 @@ class Road(Protocol):
 class OwnCommand:
     """A car that knows its command and lag, and hears where its leader is and how fast (car following).
 
-    The box holds the acceleration that the lag gives without a disturbance: the true one is off by at most `off`, the bound of every sum
+    The box holds the acceleration that the lag gives without a disturbance. The true one is off by at most `off`. This bounds every sum
     |E^(k-j) w_j + ... + E w_(k-1) + w_k|, E the lag's factor in a step, w the disturbance of the acceleration.
     """
 

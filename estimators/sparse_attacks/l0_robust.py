@@ -2,9 +2,9 @@
 
     min #{i : E_i != 0}     s.t.  Y_i = O_i x + E_i + dw_i,  |dw_i| <= D_i
 
-For |K| = 0, 1, ..., s: K explains the window where an x has |Y_i - O_i x| <= D_i for all i outside of K. That is decided by the least
-squares on these sensors where its residuals are inside, or so far outside that no x can be: with the projection P on the residuals' space,
-|P Y| <= |P| D is needed. Else a linear program decides (scipy, HiGHS). Of several K of one size the first counts. The bounds are
+For |K| = 0, 1, ..., s: K explains the window where an x has |Y_i - O_i x| <= D_i for all i outside of K. The least squares on these
+sensors decide that where the residuals are inside, or so far outside that no x can be inside. With the projection P on the residuals'
+space, |P Y| <= |P| D is needed. Else a linear program decides (scipy, HiGHS). Of several K of one size the first counts. The bounds are
 
     D_i(t) = sigmas (R_ii + sum_{j<t} c_i A^j Q A^j' c_i')^(1/2)
 """

@@ -11,8 +11,8 @@ With r = 1 this converges slowly. `solver=program` then takes the exact optimum,
 
     min sum_m t_m     s.t.  -t_m <= Y_m - O_m x <= t_m
 
-Missing readings have no row. Where the rows that are left do not determine x, or HiGHS finds no optimum, the estimate is that of the steady
-Kalman filter, as before the window is full.
+Missing readings have no row. Where the others do not determine x, or HiGHS finds no optimum, the estimate is that of the steady Kalman
+filter. So it is before the window is full.
 
 s sensors can be corrected where no x has sum_{i in K} |O_i x| >= sum_{i not in K} |O_i x| for any K of s sensors, without noise. Rows over
 the sensors' noise (`rows=sigmas`) break this where the most accurate sensors are attacked.

@@ -1,12 +1,12 @@
 """Minimax estimation under integrity attacks (Mo and Sinopoli 2015; thesis, [14]), applied to each step's innovations.
 
 An attacker replaces any l of m readings and knows everything. With 2l >= m nothing that is measured helps: the estimate is the prediction.
-Else each set I of m - 2l sensors has its own correction d_I = K_I r, with the gain of these sensors alone, and the middle of them is taken:
+Else each set I of m - 2l sensors has its own correction d_I = K_I r, with the gain of these sensors alone. Their middle is taken:
 
     f(r) = max_{|J| = m - l} min_{I in J} d_I        (for each state; halfway to min max, which is the same for equal sensors)
 
 One J has honest sensors only, and every J has an honest I: f lies between the least and the largest honest d_I, whatever is sent. For equal
-sensors of a scalar, f is the mean without the l smallest and l largest readings, times the gain; with m = 2l + 1 it is the median.
+sensors of a scalar, f is the mean without the l smallest and l largest readings, times the gain. With m = 2l + 1 it is the median.
 
 The paper's optimal estimators have this form. Its gains, though, depend on the prior: each set has the gain here that is best without an
 attack. Where the prediction is much better than a reading, a smaller gain, or none, has a smaller worst-case error (figures: the tests).

@@ -1,7 +1,7 @@
 """The subsets of sensors that an estimator goes through, and how many attacked ones it can correct.
 
-s attacked sensors can be corrected where it is 2s-sparse
-observable (Fawzi, Tabuada and Diggavi 2014; Shoukry and Tabuada 2016): two explanations of the same readings differ in 2s sensors at most.
+s attacked sensors can be corrected where the system is 2s-sparse observable (Fawzi, Tabuada and Diggavi 2014; Shoukry and Tabuada 2016).
+Two explanations of the same readings differ in 2s sensors at most.
 """
 
 from itertools import combinations

@@ -2,8 +2,8 @@
 
     each k:  plant -> sensors -> [the attack's command] -> channel -> defence -> controller -> channel -> plant
 
-Time runs k = 1, 2, ..., horizon. At k = 0 the prior is the estimate and the controller drives the first step on it, so that every
-measured step is a predict and an update. `sense` and `advance` are the two halves of a step; the attack decides between them.
+Time runs k = 1, 2, ..., horizon. At k = 0 the prior is the estimate, and the controller drives the first step on it.
+So every measured step is a predict and an update. `sense` and `advance` are the two halves of a step; the attack decides between them.
 """
 
 from __future__ import annotations
@@ -118,8 +118,9 @@ class LoopState(NamedTuple):
 class Loop:
     """A closed loop of one plant under one defence, for B independent episodes.
 
-    `told`: the model that defence, controller, channel and attacker use, where it differs from the model of plant and sensor; `load`: the
-    vehicle's mass over the nominal one, which divides a commanded acceleration [-]; `link`: readings that are lost or late.
+    `told`: the model that defence, controller, channel and attacker use, where it differs from the model of plant and sensor.
+    `load`: the vehicle's mass over the nominal one, which divides a commanded acceleration [-].
+    `link`: readings that are lost or late.
     """
 
     plant: Plant

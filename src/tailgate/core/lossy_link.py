@@ -28,7 +28,7 @@ class Link:
     """Loses each reading with a probability, independently, and delivers the others some steps late."""
 
     loss: Probability = param(0.0, "probability that a reading is lost [-]")
-    latency: Count = param(0, "steps by which readings and messages are late; the first one stands for what is not there yet")
+    latency: Count = param(0, "steps by which readings and messages are late; the first one fills in for those that are not there yet")
 
     @property
     def perfect(self) -> bool:

@@ -116,7 +116,7 @@ def read_trained(kind: type[T], form: str, path: Path, field: str, where: str) -
         raise InputError(where, shown, f"a JSON object of format {form!r}")
     header = build(kind, data, where)
     if not header.tensors or Path(header.tensors).name != header.tensors:
-        raise InputError(f"{where}.tensors", header.tensors, "the name of a file beside the JSON file")
+        raise InputError(f"{where}.tensors", header.tensors, "the name of a file in the folder of the JSON file")
     try:
         blob = read_bytes(path.with_name(header.tensors), TENSORS)
     except OSError as error:

@@ -48,13 +48,14 @@ def param(default: object, doc: str, if_any: bool = False, cut: str = "") -> Any
 class Model:
     """The public model of the plant: x+ = A x + B u + c + w, y_i = C_i x + v_i, where x is one state for all agents.
 
-    A (n, n), B (n, m), c (n,), C (N, q, n), Q = cov w (n, n), R = cov v (N, q, q); graph (N, N) bool, [i, j] when i hears j;
-    dt [s]; `sensors` names the q rows of C, `v2v` the fields of the message that a controller hears, `actuators` what an agent commands.
-    Row i of `gap` and `speed` (N, n) says how agent i's gap to the vehicle ahead and its own speed depend on x; a row of zeros, the
-    default, is an agent without a road. `challenge` is the number of complex samples that a sensor which listens to its own echo takes
-    while its probe is muted; 0, the default, is a sensor that does not: noise_jam and echo_delay reach only those that do (`air`).
+    A (n, n), B (n, m), c (n,), C (N, q, n), Q = cov w (n, n), R = cov v (N, q, q), dt [s]. graph (N, N) bool is true at [i, j] when i
+    hears j. `sensors` names the q rows of C, `v2v` the fields of the message that a controller hears, `actuators` what an agent commands.
+    Row i of `gap` and `speed` (N, n): agent i's gap to the vehicle ahead and its own speed as functions of x. A row of zeros, the
+    default, is an agent without a road.
+    `challenge` is the number of complex samples that a sensor which listens to its own echo takes while its probe is muted.
+    0, the default, is a sensor that does not listen: noise_jam and echo_delay reach only those that do (`air`).
     `gains` names the wires whose signal the agents' own laws weigh by a gain that an insider can scale: the error, then its rate.
-    `lane` is half of the width of a lane [m] whose nearer line takes the place of the car ahead; 0, the default, is a road with cars.
+    `lane` is half of the width of a lane [m] whose nearer line takes the place of the car ahead. 0, the default, is a road with cars.
     """
 
     A: Array

@@ -5,9 +5,10 @@ monotone in the Loewner order, and a loss is never below a reading. Compare two 
 covariance is never worse off, so that the other can be dropped. This is dynamic programming over sets of covariances. Both maps are also
 concave, so that F((1 + s) P) <= (1 + s) F(P): dropping what is below (1 + s) times another costs at most that factor in each step.
 
-One state has one covariance per number of steps left. With |a| >= 1 the whole budget in one block at the end is then the best for the last
-covariance: exchanging a loss and a later reading never helps. It is the answer of H. Zhang, P. Cheng, L. Shi and J. Chen (Optimal
-Denial-of-Service Attack Scheduling with Energy Constraint, IEEE TAC 2015), whose sensor sends its own estimate instead of its readings.
+One state has one covariance per number of steps left. With |a| >= 1 one block of losses at the end is then the best for
+the last covariance. It has the whole budget: exchanging a loss and a later reading never helps. This is the answer of H. Zhang, P. Cheng,
+L. Shi and J. Chen (Optimal Denial-of-Service Attack Scheduling with Energy Constraint, IEEE TAC 2015), whose sensor sends its own estimate
+instead of its readings.
 """
 
 from __future__ import annotations
@@ -217,8 +218,8 @@ def farthest(model: Model, P: Array, steps: int) -> Array:
 def stealth_programme(model: Model, P: Array, direction: Array, gate: float, bound: float, steps: int) -> tuple[float, Array]:
     """Return the largest e' (x^ - x) after `steps` steps without noise, and the injected values (steps, q), by cvxpy.
 
-    A value that is injected, and not an innovation, is bounded: r_k = a_k - C A d_(k-1) for a deviation d, so that a bound ties the steps
-    together. P (n, n) is the predicted covariance at the first step.
+    The bound is on the injected value, not on the innovation: r_k = a_k - C A d_(k-1) for a deviation d. It ties the steps together.
+    P (n, n) is the predicted covariance at the first step.
     """
     try:
         cvxpy = import_module("cvxpy")
@@ -243,7 +244,7 @@ def stealth_programme(model: Model, P: Array, direction: Array, gate: float, bou
 
 
 class Holding(NamedTuple):
-    """x+ = a x - g h + w, where h is the reading that the loop acts on: x itself, or an old one that is held; w has the sd `sd`."""
+    """x+ = a x - g h + w. The loop acts on the reading h: x itself, or an old one that is held. w has the standard deviation `sd`."""
 
     a: float
     g: float  # b times the feedback gain
@@ -307,8 +308,8 @@ class HoldTable(NamedTuple):
 def best_holds(loop: Holding, rules: Rules, horizon: int, objective: Objective, grid: Grid) -> HoldTable:
     """Return when to hold, by dynamic programming backwards over the state x, the last good reading h and the budget left.
 
-    What is made large is the expected squared error of a defence that believes the reading. Held at h it is (x - h)^2, and
-    x+ = a x - g h + w; else it is 0, x+ = (a - g) x + w, and x is the last good reading.
+    The attack maximises the expected squared error of a defence that believes the reading. While the reading is held at h, the error
+    is (x - h)^2, and x+ = a x - g h + w. Else it is 0, x+ = (a - g) x + w, and x is the last good reading.
     """
     x, h = grid.points[:, None], grid.points[None, :]
     size, budget = len(grid.points), rules.budget

@@ -69,7 +69,7 @@ def _null_space(A: Array, value: complex) -> Array:
 def blind(model: Model, graph: Array | None = None) -> list[int]:
     """Return the agents that cannot know the whole state from their own sensors and those of the agents that reach them.
 
-    `graph` (N, N) stands in for the model's: nobody but oneself, for a filter that hears nobody.
+    `graph` (N, N) replaces the model's: for a filter that hears nobody, each agent reaches itself alone.
 
     Popov, Belevitch and Hautus: (A, C) is detectable if no eigenvector of an eigenvalue that does not die out has C v = 0.
     """

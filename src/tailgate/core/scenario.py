@@ -30,8 +30,8 @@ _COMPONENTS = ("plant", "sensor", "controller", "manoeuvre")
 class Scenario:
     """plant + sensor + controller + manoeuvre + horizon + threat model.
 
-    `truth` holds what differs from the `plant` and `sensor` that everyone knows: changed fields of either; `load`, the mass over the
-    nominal one, which divides a commanded acceleration; `loss` and `latency` of readings.
+    `truth` holds the differences from the `plant` and `sensor` that everyone knows: changed fields of either, `load`, and `loss` and
+    `latency` of readings. `load` is the mass over the nominal one, which divides a commanded acceleration.
     """
 
     name: str
@@ -126,7 +126,7 @@ class Suite:
     knowledge: str | None = param(None, "knowledge that every attacker is granted; none: the least that each needs")
     shown: dict[int, str] = dataclasses.field(default_factory=dict, metadata={"doc": "doses that a board shows rates at, and why these"})
     bound: Positive | None = param(None, "error above which an episode counts as damaged where nobody can collide [unit of max_error]")
-    robustness: tuple[str, ...] = param((), "those scenarios whose plant is not the one that a defence is told")
+    robustness: tuple[str, ...] = param((), "those scenarios whose plant is not the one that a defence assumes")
     adaptive: dict[str, Any] = dataclasses.field(default_factory=dict, metadata={"doc": "how attackers are trained against a defence"})
     held_out: tuple[str, ...] = param((), "attacks, by name, that are kept out of logs for those who learn a detector")
     progress: Fraction | None = param(None, "share of its clean distance below which an attacked car counts as damaged; none: never")

@@ -1,7 +1,7 @@
 """Learned policies for the ensemble: evolution of weights from several starts, of which fewer and fewer go on.
 
 A start is a network that rests, one that imitates the best script found so far, or a published policy. All starts learn for some
-generations; the better half of them goes on with more episodes a generation, so that the order of the members is less a matter of luck.
+generations. The better half goes on with more episodes a generation, which leaves less of the members' order to chance.
 The method is CMA-ES with a diagonal covariance (Ros and Hansen 2008). One compiled program plays all: its parameters are the weights.
 """
 

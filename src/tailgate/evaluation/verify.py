@@ -55,10 +55,10 @@ def verify(
     """Play rows again and compare hashes, metrics and everything else that they record.
 
     `sample`: number of rows, drawn by `sample_seed`; None: all. `batch`: episodes side by side instead of the row's own number, which
-    changes no result. The report has `status` (verified: every row that was asked for agrees; else claimed), `counts`, `entries` (the
-    same for each defence), `findings` (rows that differ or could not be checked, lines counted from 1) and `reasons`. `submissions`:
-    classes that rows of `leaderboard submit` are about, each in a sandbox, "bwrap/module:Class". `files`: the file that each row is from;
-    then the report has the counts of each file too.
+    changes no result. The report has `status`, `counts`, `entries` (the same for each defence), `findings` and `reasons`. The status is
+    "verified" where every row that was asked for agrees, else "claimed". Findings are rows that differ or could not be checked, by
+    line, counted from 1. `submissions`: classes that rows of `leaderboard submit` are about, each in a sandbox, "bwrap/module:Class".
+    `files`: the file that each row is from; then the report has the counts of each file too.
     """
     apart = {_target(text): text for text in submissions}
     for name, value in (("sample", sample), ("batch", batch), ("workers", workers)):

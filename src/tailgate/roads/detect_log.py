@@ -46,7 +46,7 @@ class Settings:
     window: float = WINDOW
     dose: float = DOSE
     threat: tuple[tuple[str, Any], ...] = ()
-    hours: float | None = None  # thresholds for one false alarm in so many hours on synthetic roads; none: as given
+    hours: float | None = None  # thresholds for one false alarm in this time on synthetic roads; none: as given
 
 
 class Played(NamedTuple):
@@ -110,7 +110,7 @@ def synthetic(dt: float, noise: Noise) -> dict[str, Any]:
 
 
 def at_hours(defence: str, dt: float, noise: Noise, hours: float, onsets: int = 100) -> dict[str, Any]:
-    """Return the threshold of a defence for one false alarm in so many hours on the synthetic road, with its count on fresh seeds."""
+    """Return the threshold of a defence for one false alarm in `hours` on the synthetic road, with its count on fresh seeds."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "synthetic.yaml"
         path.write_text(yaml.safe_dump(synthetic(dt, noise)), encoding="utf-8")

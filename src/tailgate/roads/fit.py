@@ -1,7 +1,7 @@
 """Fit of the production-like ACC to recorded cars, shown on windows that the fit did not see.
 
-Each car is fitted behind the measured car ahead of it. It is then shown alone behind that car, and in a string in which only the leader
-is measured: errors of one car then reach the next. The gap at standstill is measured, where the cars wait before the start.
+Each car is fitted behind the measured car ahead of it. It is then shown alone behind that car, and in a string where only the leader is
+measured. In the string, errors of one car reach the next. The gap at standstill is measured, where the cars wait before the start.
 """
 
 from __future__ import annotations

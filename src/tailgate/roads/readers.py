@@ -64,7 +64,7 @@ def mapping_of(texts: Sequence[str]) -> tuple[tuple[str, str, str], ...]:
 def read(source: str, format: str | None = None, choice: Choice = Choice()) -> list[Recording]:
     """Return the recordings of a file or folder, or of a trace of the package, each validated.
 
-    format: one of FORMATS; none: told from the name and the header.
+    format: one of FORMATS; none: found from the name and the header.
     """
     path = Path(source)
     if format is not None and format not in FORMATS:

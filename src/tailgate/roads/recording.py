@@ -68,8 +68,8 @@ class Recording:
 def checked(raw: Raw, where: str) -> Recording:
     """Return the recording on a uniform grid. Repairs are counted; what is not one of them is refused.
 
-    Repeated times are dropped (up to 1 %), missing or impossible readings are marked, samples that jitter are interpolated, a hole in
-    time ends a segment, and segments below 5 s are dropped.
+    Repeated times are dropped (up to 1 %), missing or impossible readings are marked, and samples that jitter are interpolated. A hole
+    in time ends a segment; segments below 5 s are dropped.
 
     Raises
     ------

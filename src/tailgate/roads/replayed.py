@@ -27,14 +27,14 @@ PRIOR = (1.0, 0.25, 0.25, 1e-6)
 
 
 class Noise(NamedTuple):
-    """The standard deviations that a defence is told [m], [m/s]."""
+    """The standard deviations that a defence assumes [m], [m/s]."""
 
     range_sd: float = RANGE_SD
     speed_sd: float = SPEED_SD
 
 
 def process_var(dt: float) -> tuple[float, float, float, float]:
-    """Return the variances of a step dt [s] that defences are told, of d, dv, a_ahead and v."""
+    """Return the variances of a step dt [s] that defences assume, of d, dv, a_ahead and v."""
     return 1e-6, 1e-5, ACCEL_VAR * dt, 1e-6
 
 
@@ -166,7 +166,7 @@ class Cut(NamedTuple):
 
 
 def cut(recording: Recording, noise: Noise, window: float | None) -> Cut:
-    """Return whole segments side by side, or windows of so many seconds."""
+    """Return whole segments side by side, or windows of `window` seconds."""
     parts: list[tuple[float, Segment]] = []
     for segment in recording.segments:
         if window is None:
