@@ -25,7 +25,9 @@ def add(commands: Commands) -> None:
     """Add `list` to the commands."""
     about = "what there is: defences, attacks, the zoo, scenarios and their parts, suites, metrics, traces; or a graph"
     command = commands.add_parser("list", help=about)
-    command.add_argument("what", nargs="?", choices=list(_cards()), help="only these; attacks: with the zoo of trained policies")
+    groups = list(_cards())
+    command.add_argument("what", nargs="?", choices=groups, metavar="GROUP",
+                         help=f"only these: {', '.join(groups)} (attacks: with the zoo of trained policies)")  # fmt: skip
     command.add_argument("--all", action="store_true", help="everything, with parameters (default: how many there are of each)")
     command.add_argument("--graph", metavar="SCENARIO", help="draw who hears whom in this scenario instead (needs tailgate[viz])")
     command.add_argument("--out", metavar="FILE", help="the drawing: .png (default: SCENARIO.png), .svg or .pdf")
