@@ -7,17 +7,16 @@ import json
 import secrets
 import shlex
 import sys
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from tailgate.base.errors import InputError
 from tailgate.base.progress import Update, console, progress
+from tailgate.cli.tables import table as table
 from tailgate.core.schema import scalar
 
 T = TypeVar("T")
@@ -124,19 +123,6 @@ def print_json(data: object) -> None:
 def show(options: argparse.Namespace, data: T, tables: Callable[[T], None]) -> None:
     """Print data as JSON with --json, else as tables."""
     (print_json if options.json else tables)(data)
-
-
-def table(
-    columns: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None, caption: str | None = None, *,
-    numbers: Container[int] = (),
-) -> None:  # fmt: skip
-    """Print a table of texts. numbers: the columns that are set to the right."""
-    made = Table(title=title and escape(title), caption=caption and escape(caption))
-    for i, heading in enumerate(columns):
-        made.add_column(escape(heading), overflow="fold", justify="right" if i in numbers else "left")
-    for row in rows:
-        made.add_row(*map(escape, row))
-    console().print(made)
 
 
 def say(text: str, soft_wrap: bool = False) -> None:
