@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tailgate.base.errors import unknown
-from tailgate.base.plots import MARKERS, canvas
+from tailgate.base.plots import MARKERS, canvas, drawn
 from tailgate.base.pytree import Array
 
 from .files import read_board
@@ -160,13 +160,7 @@ def _figure(board: Data, form: str, most: int | None) -> bytes:
         figure = _over_doses(entries, curves)
     figure.axes[0].set_title(f"{held.suite.name}, black box")
     figure.axes[0].grid(alpha=0.3)
-    out = io.BytesIO()
-    metadata = {"Date": None} if form == "svg" else {"CreationDate": None, "Creator": None, "Producer": None}
-    import matplotlib
-
-    with matplotlib.rc_context({"svg.hashsalt": held.suite.hash}):
-        figure.savefig(out, format=form, metadata=metadata)
-    return out.getvalue()
+    return drawn(figure, form, held.suite.hash)
 
 
 def _over_doses(entries: Sequence[Entry], curves: Mapping[str, Curve]) -> Figure:

@@ -15,6 +15,7 @@ from typing import Any, TypeAlias, TypeVar
 from rich.console import Console
 
 from tailgate.base.errors import InputError
+from tailgate.base.plots import FORMS
 from tailgate.base.progress import Update, console, progress
 from tailgate.cli.tables import table as table
 from tailgate.core.schema import scalar
@@ -42,6 +43,7 @@ OPTIONS: dict[str, dict[str, Any]] = {  # that several commands have in the same
     "--sample-seed": {"type": int, "metavar": "N", "help": "which ones (default: a new secret each time; the report names it)"},
     "--out": {"required": True, "metavar": "DIR", "help": "folder of the boards"},
     "--title": {"help": "title of the page"},
+    "--picture": {"default": "png", "choices": list(FORMS), "help": "form of pictures (default png); svg and pdf are vectors, for papers"},
     "--no-replays": {"action": "store_true", "help": "leave out the replays of the worst episodes"},
     "--json": {"action": "store_true", "help": "print the report as JSON"},
 }
@@ -95,8 +97,8 @@ def played_by(scenario: str, defence: str, attack: str, threat: dict[str, Any]) 
 def picture(option: str, text: str) -> Path:
     """Return the file of a picture. Raises InputError for another ending than that of what is drawn."""
     path = Path(text)
-    if path.suffix.lower() != ".png":
-        raise InputError(option, text, "a file name that ends in .png")
+    if path.suffix.lower().removeprefix(".") not in FORMS:
+        raise InputError(option, text, f"a file name that ends in {', '.join('.' + form for form in FORMS)}")
     return path
 
 

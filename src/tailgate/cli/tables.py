@@ -51,7 +51,7 @@ def table(
     A table that is too wide loses its vertical lines, then the columns with one value. If that is not enough, long texts of one column
     get numbers and are listed below. A table that is wider still is printed as a list, row by row.
     """
-    out, whole = console(), _Form(list(columns), [list(row) for row in rows], [i in numbers for i in range(len(columns))], [])
+    out, whole = console(), _whole(columns, rows, numbers)
     for form, style in itertools.product(_forms(whole), STYLES):
         widths = _widths(form, out.width - style.around(len(form.columns)))
         if widths is not None:
@@ -61,6 +61,12 @@ def table(
                     out.print(line, markup=False, highlight=False, soft_wrap=True)
             return
     _listed(whole, title, caption, out.width, lambda line: out.print(line, markup=False, highlight=False, soft_wrap=True))
+
+
+def _whole(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: Container[int]) -> _Form:
+    """Return a table with a text in each place; a row may end early."""
+    filled = [[*row, *[""] * (len(columns) - len(row))] for row in rows]
+    return _Form(list(columns), filled, [i in numbers for i in range(len(columns))], [])
 
 
 def _forms(whole: _Form) -> Iterable[_Form]:
