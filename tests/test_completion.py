@@ -23,7 +23,8 @@ def completed(line: str, out: Path) -> set[str]:
     [
         ("tailgate eval", {"evaluate"}), ("tailgate evaluate --sui", {"--suite"}), ("tailgate evaluate --suite quick", {"quick-v0", "quick-v1"}),
         ("tailgate leaderboard run radar", {"radar-v0", "radar-v1"}), ("tailgate attack chi2_kf", {"chi2_kf", "chi2_kf_sparse"}),
-        ("tailgate evaluate --attack dos_ho", {"dos_hold"}),
+        ("tailgate evaluate --attack dos_ho", {"dos_hold"}), ("tailgate leaderboard export quick", {"quick-v1"}),
+        ("tailgate leaderboard export quick-v1 --format ", {"csv", "latex", "bibtex", "svg", "pdf"}),
     ],
 )  # fmt: skip
 def test_a_shell_is_told_how_a_line_may_go_on(line: str, words: set[str], tmp_path: Path) -> None:

@@ -124,6 +124,15 @@ def test_the_command(tmp_path, capsys):
     assert "open loop; errors against a smoother" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("form, start", [("svg", b"<?xml"), ("pdf", b"%PDF")])
+def test_the_picture_is_a_vector_where_its_name_ends_so(form, start, tmp_path):
+    """And the same bytes each time."""
+    run = ["detect-log", "asta-braking", "--vehicle", "5", "--defence", "kf", "--quiet", "--plot"]
+    files = [tmp_path / f"{name}.{form.upper()}" for name in "ab"]
+    assert [main([*run, str(path)]) for path in files] == [0, 0]
+    assert files[0].read_bytes().startswith(start) and files[0].read_bytes() == files[1].read_bytes()
+
+
 @pytest.mark.parametrize("arguments, words", [
     (["nowhere.csv", "--defence", "kf"], "file: got 'nowhere.csv'"), (["asta-braking", "--defence", "kff"], "kff"),
     (["asta-braking", "--defence", "kf", "--vehicle", "9"], "--vehicle: got '9'"), (["asta-braking", "--defence", "kf", "--format", "xls"], "--format: got 'xls'"),
@@ -131,7 +140,7 @@ def test_the_command(tmp_path, capsys):
     (["asta-braking", "--defence", "kf", "--window", "1"], "--window: got 1.0"), (["asta-braking", "--defence", "kf", "--range-sd", "0"], "--range-sd: got 0.0"),
     (["asta-braking", "--defence", "kf", "--hours", "-1"], "--hours: got -1.0"), (["asta-braking", "--defence", "kf", "--threat", "fdi"], "--threat"),
     (["asta-braking", "--defence", "kf", "--threat", "fdi_bound=-1"], "threat_model.fdi_bound"), (["asta-braking", "--defence", "kf", "--map", "x=y"], "--map"),
-    (["asta-braking", "--defence", "kf", "--plot", "dl"], "--plot: got 'dl'; expected a file name that ends in .png"),
+    (["asta-braking", "--defence", "kf", "--plot", "dl"], "--plot: got 'dl'; expected a file name that ends in .png, .svg, .pdf"),
 ])  # fmt: skip
 def test_bad_input_is_refused(arguments, words, capsys):
     assert main(["detect-log", *arguments]) == 2

@@ -111,3 +111,16 @@ def test_another_form_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["leaderboard", "export", str(FILE), "--format", "docx"]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "docx" in error and all(form in error for form in FORMATS)
+
+
+def test_a_published_board_has_a_name(capsysbinary: pytest.CaptureFixture[bytes], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A file of that name comes first; a name that no board has is refused with the names that are there."""
+    assert main(["leaderboard", "export", "quick-v1", "--format", "csv"]) == 0
+    assert capsysbinary.readouterr().out == exported(load("quick-v1"), "csv") == exported(load(FILE), "csv")
+    assert main(["leaderboard", "export", "quick-v7", "--format", "csv"]) == 2
+    error = capsysbinary.readouterr().err
+    assert b"'quick-v7'" in error and b"quick-v1" in error and error.count(b"\n") == 1
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "quick-v1").write_text("{}")
+    assert main(["leaderboard", "export", "quick-v1", "--format", "csv"]) == 2
+    assert b"format" in capsysbinary.readouterr().err

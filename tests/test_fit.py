@@ -90,7 +90,7 @@ def test_the_defaults_of_the_controller_are_the_fit_to_all_cars(tmp_path, capsys
     (["--trace", "asta-string:nan"], "--trace: got 'asta-string:nan'; expected NAME or NAME:SECONDS, with seconds not below 0"),
     (["--trace", "asta-string:-30"], "--trace: got 'asta-string:-30'; expected NAME or NAME:SECONDS"),
     (["--trace", "asta-string:x"], "--trace: got 'asta-string:x'; expected NAME or NAME:SECONDS"),
-    (["--plot", "fit.svg"], "--plot: got 'fit.svg'; expected a file name that ends in .png"),
+    (["--plot", "fit.gif"], "--plot: got 'fit.gif'; expected a file name that ends in .png, .svg, .pdf"),
     (["--window", "1"], "fit.window: got 1.0; expected 5 to 1000 s"),
     (["--window", "700"], "fit.window: got 700.0; expected at most half of the recording"),
     (["--delay", "9"], "fit.delays: got [9.0]; expected delays of 0 to 3 s"),

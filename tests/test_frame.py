@@ -1,10 +1,17 @@
 """Rows in a notebook."""
 
+import csv
+import io
+import json
 import sys
 
 import pytest
 
 import tailgate
+from tailgate.board.export import COLUMNS, exported
+from tailgate.board.files import load
+from tailgate.board.frame import BoardData
+from tailgate.board.head import lines
 from tailgate.evaluation.frame import SHOWN, Rows
 
 
@@ -49,3 +56,31 @@ def test_without_pandas_one_line_says_which_extra(rows, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match=r"pip install 'tailgate\[pandas\]'"):
         rows.to_pandas()
+
+
+def test_a_board_is_a_frame_with_the_columns_of_the_csv():
+    """The same figures: numbers as numbers, none where the CSV has none."""
+    pandas = pytest.importorskip("pandas")
+    board = load("quick-v1")
+    frame, rows = board.to_pandas(), list(csv.DictReader(io.StringIO(exported(board, "csv").decode())))
+    assert tuple(frame.columns) == COLUMNS and len(frame) == len(rows)
+    for name in COLUMNS:
+        assert [None if pandas.isna(x) or x == "" else str(x) for x in frame[name]] == [row[name] or None for row in rows], name
+    for name in ("rank_best", "undamaged", "undamaged_low", "attacks"):
+        assert pandas.api.types.is_numeric_dtype(frame[name])
+    assert isinstance(board, dict) and board == json.loads(json.dumps(board))
+
+
+def test_a_notebook_shows_the_head_of_a_board():
+    board = load("quick-v1")
+    page, head = board._repr_html_(), lines(board)
+    assert page.count("<tr>") == len(head) and "<th>defence</th>" in page and all(f"<td>{line[0]}</td>" in page for line in head[1:])
+    assert repr(board) == "Board quick-v1 of 20 defences and 484 cells; a mapping, .to_pandas()"
+    wild = BoardData(json.loads(json.dumps(board).replace('"always_brake"', '"<b>brake"')))
+    assert "&lt;b&gt;brake" in wild._repr_html_() and "<b>" not in wild._repr_html_()
+
+
+def test_a_board_without_pandas_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match=r"pip install 'tailgate\[pandas\]'"):
+        load("quick-v1").to_pandas()

@@ -48,11 +48,20 @@ def test_the_pictures_show_the_figures():
         assert one.shape != two.shape or (one != two).any()
 
 
+@pytest.mark.parametrize("form, start", [("svg", b"<?xml"), ("pdf", b"%PDF")])
+def test_vectors_repeat(form, start, tmp_path):
+    first, again = ([path.read_bytes() for path in write_overview(TABLE, tmp_path / name, form)] for name in "ab")
+    assert first == again and len(first) == 2 and all(content.startswith(start) for content in first)
+    assert {path.suffix for path in (tmp_path / "a").iterdir()} == {f".{form}"}
+
+
 def test_the_command_draws(tmp_path, capsys):
     """tailgate evaluate --plot DIR names what it wrote; a directory that cannot be written is one clear error."""
     run = ["evaluate", "--scenario", "thesis-ch4-v0", "--defence", "kf", "--attack", "none", "--attack", "fdi", "--seeds", "4", "--dose", "none"]
     assert cli.main([*run, "--plot", str(tmp_path / "p")]) == 0
     assert str(tmp_path / "p" / "rmse-against-gap.png") in capsys.readouterr().err
+    assert cli.main([*run, "--plot", str(tmp_path / "p"), "--picture", "svg"]) == 0
+    assert str(tmp_path / "p" / "rmse-against-gap.svg") in capsys.readouterr().err
     (tmp_path / "file").write_text("")
     assert cli.main([*run, "--plot", str(tmp_path / "file")]) == 2
     assert "plot" in capsys.readouterr().err

@@ -107,11 +107,22 @@ def test_an_unknown_option_of_reset_is_refused(face, options):
     env = face()
     key = next(name for name in options if name != "reset_mask")
     for _ in range(2):
-        with pytest.raises(InputError, match=f"options: unknown key: got '{key}'"):
+        taken = "one of these .*: reset_mask" if "reset_mask" in options else "no options: reset takes none"
+        with pytest.raises(InputError, match=f"options: unknown key: got '{key}'; expected {taken}$"):
             env.reset(options=options)
         env.reset(options={})
     with pytest.raises(InputError, match="options: got 3; expected a mapping"):
         env.reset(options=3)
+
+
+def test_an_environment_shows_what_it_is():
+    """By its id or, where it has none, by scenario and defence, as the vector environment of Gymnasium does; no address."""
+    v1 = "tailgate/CarFollowing-v1"
+    assert repr(gymnasium.make(v1).unwrapped) == f"AdversaryEnv({v1})"
+    assert repr(gymnasium.make_vec(v1, num_envs=2)) == f"AdversaryVectorEnv({v1}, num_envs=2)"
+    assert repr(gymnasium.make(DEFENDER).unwrapped) == "DefenderEnv(tailgate/Defender-v0)"
+    assert repr(AdversaryEnv(scenario="radar-braking-v0", defence="kf")) == "AdversaryEnv(radar-braking-v0, kf)"
+    assert repr(DuelEnv(scenario="stop-and-go-v0")) == "DuelEnv(stop-and-go-v0, Steered)"
 
 
 WIDE = [1e9, -1.001, np.inf, np.nan]

@@ -313,6 +313,8 @@ def test_the_commands_write_reports_and_pictures(
         assert cli.main([*words, "--out", "out", "--json"]) == 0
         assert json.loads(capsys.readouterr().out) == json.loads((tmp_path / "out" / f"{name}.json").read_text())
         assert (tmp_path / "out" / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
+        assert cli.main([*words, "--out", "vectors", "--picture", "pdf"]) == 0
+        assert (tmp_path / "vectors" / f"{name}.pdf").read_bytes()[:4] == b"%PDF" and not capsys.readouterr().out.startswith("{")
     assert cli.main(commands["timing"]) == 0
     assert "yoked" in capsys.readouterr().out
     assert cli.main(commands["transfer"]) == 0

@@ -27,7 +27,7 @@ from tailgate.core.threat import KNOWLEDGE
 from tailgate.envs.gym.actions import ActionSpec
 from tailgate.envs.gym.attacker_mdp import CAR_FOLLOWING, FACES, Outcome, Seat, Tally
 from tailgate.envs.gym.mixture import Mixture
-from tailgate.envs.gym.specs import Specified, check_options, in_box
+from tailgate.envs.gym.specs import Specified, check_options, in_box, shown
 from tailgate.estimators.challenge.steered import Steered, SteeredChallenge, SteeredPlan, SteeredState
 from tailgate.estimators.challenge.steering import LIMIT, Menu
 
@@ -258,6 +258,9 @@ class DefenderEnv(Specified, gymnasium.Env[Array, Any]):
         self.state: DuelState | None = None
         self.attacker: Attacker | None = None
         self.over = np.zeros(1, bool)
+
+    def __repr__(self) -> str:
+        return shown(self, self.spec, self.duel.seat)
 
     def card(self) -> dict[str, Any]:
         """Return JSON data that names this environment completely, its attacks among them, with a hash."""

@@ -24,7 +24,7 @@ from tailgate.envs.gym.attacker_mdp import FACES, Seat, Tally
 from tailgate.envs.gym.batches import PlainEpisodes, TracedEpisodes, framed, side_by_side
 from tailgate.envs.gym.observations import LIMIT
 from tailgate.envs.gym.shadow import Begun, Decided
-from tailgate.envs.gym.specs import Specified, check_options, in_box, limit_of
+from tailgate.envs.gym.specs import Specified, check_options, in_box, limit_of, shown
 from tailgate.envs.render.viewer import Screen, Viewer
 
 _WHOLE = (int, np.int64)  # an action's usual types
@@ -283,6 +283,9 @@ class AdversaryEnv(Specified, gymnasium.Env[Array, Any]):
         self._screen, self._moves = Screen(), 0  # the second: resets and steps so far
         self.observation_space = self.batch.single_observation_space
         self.action_space = self.batch.single_action_space
+
+    def __repr__(self) -> str:
+        return shown(self, self.spec, self.batch.seat)
 
     @property
     def engine(self) -> str:

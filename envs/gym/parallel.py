@@ -18,7 +18,7 @@ from tailgate.core import Array, Frame
 from tailgate.envs.gym.actions import action_space
 from tailgate.envs.gym.duel import Duel, DuelState, checked, next_game
 from tailgate.envs.gym.observations import LIMIT
-from tailgate.envs.gym.specs import check_options, limit_of
+from tailgate.envs.gym.specs import check_options, limit_of, shown
 from tailgate.envs.render.viewer import Screen, Viewer
 
 ATTACKER, DEFENDER = "attacker", "defender"
@@ -52,6 +52,9 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
         self.frame: Frame | None = None  # the last step, for rendering and curious readers
         self._rng, _ = seeding.np_random(None)
 
+    def __repr__(self) -> str:
+        return shown(self, None, self.duel.seat)
+
     def observation_space(self, agent: str) -> Any:
         return self.observation_spaces[agent]
 
@@ -66,7 +69,7 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Array], dict[str, dict[str, Any]]]:
         """Begin the game of a seed; without one the next of the running row, or a random one at first."""
-        check_options(options, ("options",))  # "options" has no meaning: PettingZoo's own tests give it
+        check_options(options, ignored=("options",))  # PettingZoo's own tests give it
         if seed is not None:
             self._rng, _ = seeding.np_random(seed)
         self.game, self.frame, self.agents = next_game(self.duel, self.game, seed, self._rng), None, list(self.possible_agents)

@@ -7,7 +7,7 @@ import dataclasses
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
@@ -16,6 +16,9 @@ from tailgate.base.errors import InputError, unknown
 from tailgate.core import Array
 from tailgate.core.registry import Family, Spec, entry_for, text_of
 from tailgate.core.schema import as_data
+
+if TYPE_CHECKING:
+    from tailgate.envs.gym.attacker_mdp import Seat
 
 ROUNDING = 1e-6  # by which a vector may leave [-1, 1]: float32 that was scaled is off by as much
 _FAMILIES: dict[str, Family] = {"defence": "defence", "attack": "attack"}  # arguments that may be objects
@@ -26,16 +29,23 @@ def in_box(actions: Array) -> bool:
     return actions.dtype.kind in "fiu" and bool((np.abs(actions) <= 1.0 + ROUNDING).all())
 
 
-def check_options(options: object, known: Iterable[str] = ()) -> None:
-    """Raise InputError for options of reset() that nobody reads."""
+def check_options(options: object, known: Iterable[str] = (), ignored: Iterable[str] = ()) -> None:
+    """Raise InputError for options of reset() that nobody reads. ignored: those that are taken and mean nothing."""
     if options is None:
         return
     if not isinstance(options, Mapping):
         raise InputError("options", options, "a mapping, or None")
-    names = tuple(known)
+    names, silent = tuple(known), tuple(ignored)
     for key in options:
-        if key not in names:
-            raise unknown("options: unknown key", key, names)
+        if key not in names and key not in silent:
+            where = "options: unknown key"
+            raise unknown(where, key, names) if names else InputError(where, key, "no options: reset takes none")
+
+
+def shown(environment: object, spec: EnvSpec | None, seat: Seat) -> str:
+    """Return the text that shows an environment: its id or, where it has none, its scenario and its defence."""
+    place = spec.id if spec else f"{seat.config['scenario']['name']}, {seat.config['defence']['spec']}"
+    return f"{type(environment).__name__}({place})"
 
 
 def limit_of(name: str, given: int | None) -> int:

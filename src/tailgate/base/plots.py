@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tailgate.base.errors import unknown
 from tailgate.base.files import writable_directory, write_atomic
 from tailgate.base.pytree import Array
 
@@ -27,6 +28,9 @@ NO_ROAD = (  # for systems without a road
     ("rmse_position", "RMS of the state's error (2-norm), median", "Blues"),
     ("max_error", "largest error of an agent's state (2-norm), median", "Purples"),
 )
+FORMS: dict[str, dict[str, None]] = {  # of pictures, and what a file says of its making: nothing that differs from call to call
+    "png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+}  # fmt: skip
 MARKERS = "osD^v<>PX*phd"
 
 
@@ -40,28 +44,55 @@ def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **optio
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
-def png(figure: Figure) -> bytes:
-    """Return the figure as a PNG file; equal figures give equal bytes."""
+def drawn(figure: Figure, form: str = "png", salt: str = "tailgate", dpi: int = 110) -> bytes:
+    """Return the figure as a file; equal figures give equal bytes.
+
+    Parameters
+    ----------
+    figure
+        Of matplotlib.
+    form
+        One of `FORMS`.
+    salt
+        Text that the names of parts in an SVG come from.
+    dpi
+        Dots per inch of a PNG.
+
+    Raises
+    ------
+    InputError
+        For another form.
+    """
+    if form not in FORMS:
+        raise unknown("picture", form, FORMS)
+    import matplotlib
+
     out = io.BytesIO()
-    figure.savefig(out, format="png", dpi=110, metadata={"Software": None})
+    with matplotlib.rc_context({"svg.hashsalt": salt}):
+        figure.savefig(out, format=form, metadata=FORMS[form], dpi=dpi if form == "png" else "figure")
     return out.getvalue()
 
 
-def write_overview(table: Table, directory: Path) -> list[Path]:
-    """Write matrices for each scenario and dose, and one scatter plot of all cells with a road; return the paths."""
+def png(figure: Figure) -> bytes:
+    """Return the figure as a PNG file; equal figures give equal bytes."""
+    return drawn(figure)
+
+
+def write_overview(table: Table, directory: Path, form: str = "png") -> list[Path]:
+    """Write matrices for each scenario and dose, and one scatter plot of all cells with a road; return the paths. form: as of `drawn`."""
     writable_directory(directory, "plot")
     good = [entry for entry in table if entry["crash"] is not None]
     out = []
     for scenario, dose in dict.fromkeys((e["scenario"], e["dose"]) for e in good):
         here = [e for e in good if (e["scenario"], e["dose"]) == (scenario, dose)]
-        name = re.sub(r"[^\w.-]+", "-", f"{scenario}-{'unlimited' if dose is None else dose}.png")
+        name = re.sub(r"[^\w.-]+", "-", f"{scenario}-{'unlimited' if dose is None else dose}.{form}")
         out.append(directory / name)
         title = f"{scenario}, budget {'unlimited' if dose is None else f'{dose} steps'}"
-        write_atomic(out[-1], png(matrix_figure(here, title)))
+        write_atomic(out[-1], drawn(matrix_figure(here, title), form))
     road = [entry for entry in good if entry["min_gap"]]
     if road:
-        out.append(directory / "rmse-against-gap.png")
-        write_atomic(out[-1], png(scatter_figure(road)))
+        out.append(directory / f"rmse-against-gap.{form}")
+        write_atomic(out[-1], drawn(scatter_figure(road), form))
     return out
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tailgate.base.errors import unknown
-from tailgate.base.plots import MARKERS, canvas
+from tailgate.base.plots import MARKERS, canvas, drawn
 from tailgate.base.pytree import Array
 
 from .files import read_board
@@ -71,22 +71,30 @@ def exported(board: Data, form: str, most: int | None = None) -> bytes:
 
 
 def _csv(board: Data, most: int | None) -> bytes:
-    """Return `COLUMNS`: a line for each defence, dose and knowledge, and one for a defence without figures."""
-    held = read_board(board)
-    entries = ordered(held.entries)
-    ranked = Counter(entry.class_ for entry in entries if entry.rank)
     out = io.StringIO()
     table = csv.DictWriter(out, COLUMNS, lineterminator="\n")
     table.writeheader()
+    table.writerows(records(board, most))
+    return out.getvalue().encode()
+
+
+def records(board: Data, most: int | None = None) -> list[dict[str, object]]:
+    """Return `COLUMNS` of a board: an entry for each defence, dose and knowledge, and one for a defence without figures.
+
+    A figure that is missing has no key. `most`: as of `exported`.
+    """
+    held = read_board(board)
+    entries = ordered(held.entries)
+    ranked = Counter(entry.class_ for entry in entries if entry.rank)
+    out = list[dict[str, object]]()
     for entry in entries[:most]:
         shared: dict[str, object] = {"defence": entry.defence, "class": entry.class_, "status": entry.status, "why": entry.why}
         if entry.rank:
             shared |= {"rank_best": entry.rank.best, "rank_worst": entry.rank.worst, "ranked_in_class": ranked[entry.class_]}
         if entry.mean_gap:
             shared["mean_gap_change"] = entry.mean_gap.value
-        for line in [_figures(entry, rate, held.suite.doses) for rate in entry.rates] or [{}]:
-            table.writerow(shared | line)
-    return out.getvalue().encode()
+        out += [shared | line for line in [_figures(entry, rate, held.suite.doses) for rate in entry.rates] or [{}]]
+    return out
 
 
 def _figures(entry: Entry, rate: Rate, doses: Sequence[int | None]) -> dict[str, object]:
@@ -160,13 +168,7 @@ def _figure(board: Data, form: str, most: int | None) -> bytes:
         figure = _over_doses(entries, curves)
     figure.axes[0].set_title(f"{held.suite.name}, black box")
     figure.axes[0].grid(alpha=0.3)
-    out = io.BytesIO()
-    metadata = {"Date": None} if form == "svg" else {"CreationDate": None, "Creator": None, "Producer": None}
-    import matplotlib
-
-    with matplotlib.rc_context({"svg.hashsalt": held.suite.hash}):
-        figure.savefig(out, format=form, metadata=metadata)
-    return out.getvalue()
+    return drawn(figure, form, held.suite.hash)
 
 
 def _over_doses(entries: Sequence[Entry], curves: Mapping[str, Curve]) -> Figure:

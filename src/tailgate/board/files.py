@@ -6,6 +6,7 @@ import json
 import lzma
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +19,44 @@ from tailgate.base.version import VERSION, plays_as
 from tailgate.core.scenario import Suite, list_suites, load_suite
 from tailgate.evaluation.stats import mean_time
 
+from .frame import BoardData
 from .schema import FORMAT, AtThreshold, Board, Data, Detection, EntryTrust, Part
 
 BOARD = "board.json"
 
 
-def load(path: Path) -> Any:
-    """Return the JSON data of a board's file, to be read by `read_board`. Raises InputError for a file of another format."""
+def published() -> dict[str, Path]:
+    """Return the files of the boards that come with the package, by the name of their suite."""
+    folder = Path(str(files("tailgate.configs").joinpath("boards")))
+    return {path.name.removesuffix(".json.xz"): path for path in sorted(folder.glob("*.json.xz"))}
+
+
+def board_named(text: str) -> Path:
+    """Return the file of a board from its path or, where no such file is, from the name of a published board."""
+    known = published()
+    if text in known and not Path(text).is_file():
+        return known[text]
+    if Path(text).exists() or "." in Path(text).name or len(Path(text).parts) > 1:  # the name of a file, which may be wrong
+        return Path(text)
+    raise unknown("board", text, known)
+
+
+def load(path: Path | str) -> Any:
+    """Return the JSON data of a board, a `BoardData`, to be read by `read_board`.
+
+    Parameters
+    ----------
+    path
+        The file, or the name of a board that comes with the package (quick-v1).
+
+    Raises
+    ------
+    InputError
+        For a file of another format, and for a name that no board has.
+    """
+    path = board_named(path) if isinstance(path, str) else path
     rows = "; rows are played again by `tailgate leaderboard verify`" if ".jsonl" in path.suffixes else ""
-    return _formatted(read_json(path, "board", "board.json", rows), f"board {path}")
+    return BoardData(_formatted(read_json(path, "board", "board.json", rows), f"board {path}"))
 
 
 def _formatted(data: object, where: str) -> dict[str, Any]:

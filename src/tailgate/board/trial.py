@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,12 +14,11 @@ from tailgate.core.scenario import Suite
 from tailgate.core.schema import digest
 from tailgate.evaluation.rows import CLEAN, read_rows
 
+from . import files as boards
 from .attacked import Progress, attack
 from .files import agree, board_in, load, read_board, save
 from .run import board_of, files_of_rows, play
 from .schema import Data
-
-SHIPPED = "boards"  # folder of the package with published boards
 
 
 class Trial(NamedTuple):
@@ -33,10 +31,9 @@ class Trial(NamedTuple):
 
 def published(suite: Suite) -> Data | None:
     """Return the board of a suite that comes with the package, None where there is none of this version of the suite."""
-    path = Path(str(files("tailgate.configs").joinpath(SHIPPED, f"{suite.name}.json.xz")))
-    if not path.is_file():
+    if suite.name not in (known := boards.published()):
         return None
-    data: Data = load(path)
+    data: Data = load(known[suite.name])
     return data if data["suite"]["hash"] == suite.hash else None
 
 

@@ -11,7 +11,7 @@ import re
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from typing import Any, NoReturn
@@ -92,9 +92,14 @@ class _Parser(argparse.ArgumentParser):
 
     given: tuple[str, ...] = ()
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
+    def __init__(self, *arguments: Any, keys: Callable[[], str] | None = None, **options: Any) -> None:
+        """keys: returns what --help lists behind all else, which no other use of the command has to wait for."""
         super().__init__(*arguments, **{"formatter_class": _Formatter} | options)
+        self.keys = keys
         self.add_argument("--quiet", action="store_true", default=argparse.SUPPRESS, help="show no progress")
+
+    def format_help(self) -> str:
+        return super().format_help() if self.keys is None else f"{super().format_help()}\n{self.keys()}\n"
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         self.given = tuple(map(str, sys.argv[1:] if args is None else args))
@@ -121,13 +126,22 @@ class _Parser(argparse.ArgumentParser):
 
 
 class _Formatter(argparse.HelpFormatter):
-    """Wraps paragraphs, and keeps lines that begin with a blank as they are, such as those of an example."""
+    """Wraps paragraphs. Lines that begin with a blank, such as those of an example, stay; a long one goes on as a shell reads it."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         lines = []
         for line in text.split("\n"):
-            lines.append(line if not line or line.startswith(" ") else super()._fill_text(line, width, indent))
+            lines.append(_command(line, width) if line.startswith(" ") else line and super()._fill_text(line, width, indent))
         return "\n".join(lines)
+
+
+def _command(line: str, width: int) -> str:
+    """Return a command in lines of this width, with a backslash at the end of each that goes on; quoted words stay whole."""
+    if len(line) <= width:
+        return line
+    whole = re.sub('"[^"]*"', lambda found: found[0].replace(" ", "\0"), line)
+    lines = textwrap.wrap(whole, width - len(" \\"), subsequent_indent=" " * 6, break_long_words=False, break_on_hyphens=False)
+    return " \\\n".join(lines).replace("\0", " ")
 
 
 def _shown(parser: argparse.ArgumentParser, words: str = "") -> None:

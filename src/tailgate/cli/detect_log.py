@@ -36,7 +36,7 @@ def add(commands: Commands) -> None:
     command.add_argument("--window", type=float, default=60.0, metavar="S", help="pieces in which an attack is played (default 60)")
     command.add_argument("--dose", type=float, default=4.0, metavar="S", help="seconds of attack in a piece (default 4)")
     command.add_argument("--threat", action="append", default=[], metavar="key=value", help="change the threat model (repeatable)")
-    command.add_argument("--plot", metavar="FILE.png", help="draw the last replay (needs tailgate[viz])")
+    command.add_argument("--plot", metavar="FILE", help="draw the last replay: .png, .svg or .pdf (needs tailgate[viz])")
     command.add_argument("--parquet", metavar="FILE", help="write every step as Parquet (needs tailgate[log])")
     command.add_argument("--json", action="store_true", help="print the figures as JSON")
     command.set_defaults(run=_detect)
@@ -69,7 +69,7 @@ def _detect(options: argparse.Namespace) -> int:
     if options.parquet and replays:
         write_parquet(Path(options.parquet), replays)
     if plot is not None and replays:
-        write_atomic(plot, draw(replays[-1]), "plot")
+        write_atomic(plot, draw(replays[-1], plot.suffix.lower()[1:]), "plot")
     show(options, rows, _tables)
     return 0
 

@@ -29,7 +29,7 @@ def add(commands: Commands) -> None:
     command.add_argument("--limit", type=float, metavar="VALUE", help="share or mean that makes a dose critical (default: 0.1 of shares)")
     add_options(command, "--purpose", "--workers")
     command.add_argument("--out", metavar="DIR", help="write rows.jsonl, dose-response.json and dose-response.png here; resumes")
-    add_options(command, "--json")
+    add_options(command, "--picture", "--json")
     command.set_defaults(run=_dose)
 
 
@@ -54,8 +54,8 @@ def _dose(options: argparse.Namespace) -> int:
     if options.out:
         from tailgate.studies.figures import dose_figure
 
-        picture = dose_figure(report) if any("points" in curve for curve in report["curves"]) else None
-        for path in write_report(Path(options.out), "dose-response", report, picture):
+        picture = dose_figure(report, options.picture) if any("points" in curve for curve in report["curves"]) else None
+        for path in write_report(Path(options.out), "dose-response", report, picture, options.picture):
             print(f"written: {path}", file=sys.stderr)
     return 1 if _nothing(report) else 0
 

@@ -41,6 +41,7 @@ def add(commands: Commands) -> None:
     add_options(command, "--workers", "--device", "--engine", "--address")
     command.add_argument("--out", metavar="FILE", help="write rows here (JSON Lines); an interrupted run resumes, other rows are set aside")
     command.add_argument("--plot", metavar="DIR", help="draw defences x attacks: error, smallest gap, collisions (needs tailgate[viz])")
+    add_options(command, "--picture")
     command.add_argument("--json", action="store_true", help="print the table as JSON")
     command.set_defaults(run=_evaluate)
 
@@ -78,7 +79,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     if options.plot:
         from tailgate.base.plots import write_overview
 
-        for path in write_overview(table, Path(options.plot)):
+        for path in write_overview(table, Path(options.plot), options.picture):
             print(f"picture: {path}", file=sys.stderr)
     failed = sum(entry["failed"] for entry in table)
     if failed:

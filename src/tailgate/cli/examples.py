@@ -35,7 +35,7 @@ EXAMPLES = {
     "leaderboard timing": "quick-v0 --out boards",
     "leaderboard retrain": "runs/quickstart/policy-0.json",
     "leaderboard admit": "fdi_ramp:trigger=near,threshold=40,rate=-0.2 --suite quick-v0 --out boards",
-    "leaderboard export": "results/quick-v1/board.json.xz --format latex --most 14",
+    "leaderboard export": "quick-v1 --format latex --most 14",
     "leaderboard build": "--rows rows.jsonl --out page",
     "log": "--suite quick-v0 --out out",
     "replay": "rows.jsonl --out replay",

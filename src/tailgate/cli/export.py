@@ -15,9 +15,9 @@ def add(actions: Commands) -> None:
     command = actions.add_parser(
         "export", help="write a board for a paper: CSV, LaTeX, BibTeX, SVG or PDF",
         description="Write the figures of a board as CSV, its head as a LaTeX table (booktabs), how to cite it as BibTeX, or damage by "
-        "dose as a picture. Example: tailgate leaderboard export results/quick-v1/board.json.xz --format latex --most 14",
+        "dose as a picture. Example: tailgate leaderboard export quick-v1 --format latex --most 14",
     )  # fmt: skip
-    command.add_argument("board", metavar="FILE", help="board.json, or board.json.xz")
+    command.add_argument("board", metavar="BOARD", help="board.json, board.json.xz, or the name of a published board: quick-v1")
     command.add_argument("--format", required=True, metavar="FORM", help="csv, latex, bibtex, svg or pdf")
     command.add_argument("--most", type=int, metavar="N", help="at most N defences, the first in the order of the page (default: all)")
     command.add_argument("--out", metavar="FILE", help="file to write (default: print it)")
@@ -31,7 +31,7 @@ def _export(options: argparse.Namespace) -> int:
 
     if options.most is not None:
         sizes.check("most", options.most)
-    content = exported(load(Path(options.board)), options.format, options.most)
+    content = exported(load(options.board), options.format, options.most)
     if options.out:
         write_atomic(Path(options.out), content)
     else:

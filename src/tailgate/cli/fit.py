@@ -26,7 +26,7 @@ def add(commands: Commands) -> None:
     command.add_argument("--delay", action="append", type=float, metavar="S",
                          help="candidate of the delay [s] (repeatable; default 0, 0.2, 0.4, 0.6, 0.8)")  # fmt: skip
     command.add_argument("--out", metavar="FILE", help="write the result as JSON")
-    command.add_argument("--plot", metavar="FILE.png", help="draw an unseen window (needs tailgate[viz])")
+    command.add_argument("--plot", metavar="FILE", help="draw an unseen window: .png, .svg or .pdf (needs tailgate[viz])")
     command.add_argument("--json", action="store_true", help="print the result as JSON")
     command.set_defaults(run=_fit)
 
@@ -54,7 +54,7 @@ def _fit(options: argparse.Namespace) -> int:
     if options.out:
         write_atomic(Path(options.out), json.dumps(held, indent=1).encode() + b"\n")
     if plot is not None:
-        write_atomic(plot, draw(held), "plot")
+        write_atomic(plot, draw(held, form=plot.suffix.lower()[1:]), "plot")
     show(options, held, _tables)
     return 0
 

@@ -9,13 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.markup import escape
-from rich.table import Table
-
 from tailgate.base.errors import InputError
-from tailgate.base.progress import console
-from tailgate.cli.shared import Commands, print_json
-from tailgate.cli.shared import table as show_table
+from tailgate.cli.shared import Commands, print_json, table
 
 if TYPE_CHECKING:
     from tailgate.core.registry import Family
@@ -25,7 +20,9 @@ def add(commands: Commands) -> None:
     """Add `list` to the commands."""
     about = "what there is: defences, attacks, the zoo, scenarios and their parts, suites, metrics, traces; or a graph"
     command = commands.add_parser("list", help=about)
-    command.add_argument("what", nargs="?", choices=list(_cards()), help="only these; attacks: with the zoo of trained policies")
+    groups = list(_cards())
+    command.add_argument("what", nargs="?", choices=groups, metavar="GROUP",
+                         help=f"only these: {', '.join(groups)} (attacks: with the zoo of trained policies)")  # fmt: skip
     command.add_argument("--all", action="store_true", help="everything, with parameters (default: how many there are of each)")
     command.add_argument("--graph", metavar="SCENARIO", help="draw who hears whom in this scenario instead (needs tailgate[viz])")
     command.add_argument("--out", metavar="FILE", help="the drawing: .png (default: SCENARIO.png), .svg or .pdf")
@@ -43,23 +40,19 @@ def _list(options: argparse.Namespace) -> int:
     if options.json:
         print_json(chosen)
         return 0
-    out = console()
     if options.what is None and not options.all:
         counts = [(name, str(len(group)), f"tailgate list {name}") for name, group in chosen.items()]
-        show_table(("what", "how many", "listed by"), counts, caption="tailgate list --all: everything", numbers=(1,))
+        table(("what", "how many", "listed by"), counts, caption="tailgate list --all: everything", numbers=(1,))
         return 0
     for title, group in chosen.items():
         if title == "zoo":
-            out.print(_zoo_table(group))
-            continue
-        if title == "traces":
-            out.print(_trace_table(group))
-            continue
-        table = Table("name", "what it is", "parameters (default)", title=title)
-        for card in group:
-            fields = ", ".join(f"{k} ({json.dumps(p['default'])})" for k, p in card.get("parameters", {}).items())
-            table.add_row(*map(escape, (card["name"], card["summary"], fields)))
-        out.print(table)
+            _zoo_table(group)
+        elif title == "traces":
+            _trace_table(group)
+        else:
+            fields = [", ".join(f"{k} ({json.dumps(p['default'])})" for k, p in card.get("parameters", {}).items()) for card in group]
+            rows = [(card["name"], card["summary"], text) for card, text in zip(group, fields, strict=True)]
+            table(("name", "what it is", "parameters (default)"), rows, title)
     return 0
 
 
@@ -110,12 +103,10 @@ def _traces() -> list[dict[str, Any]]:
     return [as_card(name) for name in cards()]
 
 
-def _zoo_table(group: list[dict[str, Any]]) -> Table:
+def _zoo_table(group: list[dict[str, Any]]) -> None:
     from tailgate.studies.policies import between, shown
 
-    table = Table(title="zoo: trained policies, played as zoo:name=NAME", caption="outcome: on report seeds, with its 95 % interval")
-    for heading in ("name", "scenario, defence", "learner, decisions", "kinds", "budget, bound", "sees", "outcome", "sha256"):
-        table.add_column(heading, no_wrap=True)  # a name that is cut cannot be played
+    rows = list[tuple[str, ...]]()
     for card in group:
         threat, measured, decisions = card["threat"] or {}, card["measured"], card["decisions"]
         outcome = "-"
@@ -124,22 +115,21 @@ def _zoo_table(group: list[dict[str, Any]]) -> Table:
             outcome = f"{measured['outcome']} {shown(measured['value'], share)}\n{between(measured, share)}"
         count = "-" if decisions is None else f"{decisions / 1e6:.2g} M" if decisions >= 1e6 else f"{decisions / 1e3:.0f} k"
         budget = "unlimited" if threat.get("budget") is None else f"{threat['budget']} steps"
-        table.add_row(
+        rows.append((
             card["name"], f"{card['scenario']}\n{card['defence']}", f"{card['learner']}\n{count}", "\n".join(threat.get("kinds", ())),
             f"{budget}\n{threat.get('fdi_bound', '-')}", card["knowledge"] + ("\n+ measurement" if threat.get("sees_measurement") else ""),
             outcome, card["sha256"][:12],
-        )  # fmt: skip
-    return table
+        ))  # fmt: skip
+    heads = ("name", "scenario, defence", "learner, decisions", "kinds", "budget, bound", "sees", "outcome", "sha256")
+    table(heads, rows, "zoo: trained policies, played as zoo:name=NAME", "outcome: on report seeds, with its 95 % interval")
 
 
-def _trace_table(group: list[dict[str, Any]]) -> Table:
-    table = Table("name", "what it is", "columns", "length, rate", "licence", "source", title="traces: recorded drives")
+def _trace_table(group: list[dict[str, Any]]) -> None:
+    rows = []
     for card in group:
-        size = f"{card['seconds']:.0f} s\n{card['rate']:g} Hz"
-        columns = ", ".join(card["columns"])
-        source = f"{card['source']}; {card['attribution']}"
-        table.add_row(*map(escape, (card["name"], card["summary"], columns, size, card["licence"], source)))
-    return table
+        size, source = f"{card['seconds']:.0f} s\n{card['rate']:g} Hz", f"{card['source']}; {card['attribution']}"
+        rows.append((card["name"], card["summary"], ", ".join(card["columns"]), size, card["licence"], source))
+    table(("name", "what it is", "columns", "length, rate", "licence", "source"), rows, "traces: recorded drives")
 
 
 def _draw(options: argparse.Namespace) -> int:

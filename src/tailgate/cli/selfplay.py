@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import json
 from typing import Any
 
 from rich.console import Console
 
 from tailgate.base.progress import progress
+from tailgate.cli.keys import listed
 from tailgate.cli.shared import Commands, add_options, say, show, table
 
 
 def add(commands: Commands) -> None:
     """Add `selfplay` to the commands."""
-    from tailgate.training.selfplay import parameters
-
-    fields = "\n".join(f"  {p['name']:<12} {p['doc']} (default: {json.dumps(p['default'])})" for p in parameters())
     command = commands.add_parser(
         "selfplay", help="train attacker and defender in turns, and measure how exploitable the defender is",
-        description="An attacker against a defender that turns the knobs of its defence. Without --config, the preset `selfplay`.",
-        epilog=f"keys (dotted below menu, payoff, threat, environment, attacker and defender, for example menu.modes=[normal]):\n{fields}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="An attacker against a defender that turns the knobs of its defence. Without --config, the preset `selfplay`: its "
+        "values are the defaults below.",
+        keys=_keys,
     )  # fmt: skip
     command.add_argument("--config", metavar="FILE", help="preset by name, or YAML file")
     command.add_argument(
@@ -30,6 +27,12 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     add_options(command, "--json", "overrides")
     command.set_defaults(run=_selfplay, kept="what was finished is kept")
+
+
+def _keys() -> str:
+    from tailgate.training.keys import selfplay_keys
+
+    return listed(selfplay_keys())
 
 
 def _selfplay(options: argparse.Namespace) -> int:

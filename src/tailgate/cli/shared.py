@@ -7,17 +7,17 @@ import json
 import secrets
 import shlex
 import sys
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from tailgate.base.errors import InputError
+from tailgate.base.plots import FORMS
 from tailgate.base.progress import Update, console, progress
+from tailgate.cli.tables import table as table
 from tailgate.core.schema import scalar
 
 T = TypeVar("T")
@@ -43,6 +43,7 @@ OPTIONS: dict[str, dict[str, Any]] = {  # that several commands have in the same
     "--sample-seed": {"type": int, "metavar": "N", "help": "which ones (default: a new secret each time; the report names it)"},
     "--out": {"required": True, "metavar": "DIR", "help": "folder of the boards"},
     "--title": {"help": "title of the page"},
+    "--picture": {"default": "png", "choices": list(FORMS), "help": "form of pictures (default png); svg and pdf are vectors, for papers"},
     "--no-replays": {"action": "store_true", "help": "leave out the replays of the worst episodes"},
     "--json": {"action": "store_true", "help": "print the report as JSON"},
 }
@@ -96,8 +97,8 @@ def played_by(scenario: str, defence: str, attack: str, threat: dict[str, Any]) 
 def picture(option: str, text: str) -> Path:
     """Return the file of a picture. Raises InputError for another ending than that of what is drawn."""
     path = Path(text)
-    if path.suffix.lower() != ".png":
-        raise InputError(option, text, "a file name that ends in .png")
+    if path.suffix.lower().removeprefix(".") not in FORMS:
+        raise InputError(option, text, f"a file name that ends in {', '.join('.' + form for form in FORMS)}")
     return path
 
 
@@ -124,19 +125,6 @@ def print_json(data: object) -> None:
 def show(options: argparse.Namespace, data: T, tables: Callable[[T], None]) -> None:
     """Print data as JSON with --json, else as tables."""
     (print_json if options.json else tables)(data)
-
-
-def table(
-    columns: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None, caption: str | None = None, *,
-    numbers: Container[int] = (),
-) -> None:  # fmt: skip
-    """Print a table of texts. numbers: the columns that are set to the right."""
-    made = Table(title=title and escape(title), caption=caption and escape(caption))
-    for i, heading in enumerate(columns):
-        made.add_column(escape(heading), overflow="fold", justify="right" if i in numbers else "left")
-    for row in rows:
-        made.add_row(*map(escape, row))
-    console().print(made)
 
 
 def say(text: str, soft_wrap: bool = False) -> None:

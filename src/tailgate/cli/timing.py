@@ -28,7 +28,7 @@ def add(commands: Commands) -> None:
     command.add_argument("--episodes", type=int, default=1000, metavar="N", help="episodes per policy and schedule (default 1000)")
     add_options(command, "--outcome", "--purpose")
     command.add_argument("--out", metavar="DIR", help="write timing.json and timing.png here (the picture needs tailgate[viz])")
-    add_options(command, "--json")
+    add_options(command, "--picture", "--json")
     command.set_defaults(run=_timing)
 
 
@@ -52,7 +52,7 @@ def _timing(options: argparse.Namespace) -> int:
     if options.out:
         from tailgate.studies.figures import timing_figure
 
-        for path in write_report(Path(options.out), "timing", report, timing_figure(report["entries"])):
+        for path in write_report(Path(options.out), "timing", report, timing_figure(report["entries"], options.picture), options.picture):
             print(f"written: {path}", file=sys.stderr)
     return 0
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +12,7 @@ from rich.console import Console
 from tailgate.base.errors import InputError
 from tailgate.base.locks import alone
 from tailgate.base.progress import cells, progress
+from tailgate.cli.keys import listed
 from tailgate.cli.shared import Commands, add_options, own_classes, played_by, print_json, say, table, tell
 
 if TYPE_CHECKING:
@@ -21,17 +20,12 @@ if TYPE_CHECKING:
     from tailgate.training.train import TrainConfig
 
 
-LONGEST = 140  # characters of a default in --help
-
-
 def add(commands: Commands) -> None:
     """Add `train` to the commands."""
-    fields = "\n".join(_keys())
     command = commands.add_parser(
         "train", help="train an adversary, compare it with scripted attacks on fresh seeds, write a page",
         description="Train an adversary. Without --config, the preset `quickstart`: its values are the defaults below.",
-        epilog=f"keys (dotted below environment, threat and the learners, for example ppo.epochs=4):\n{fields}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        keys=_keys,
     )  # fmt: skip
     command.add_argument("--config", metavar="FILE", help="preset by name, or YAML file")
     command.add_argument("--seed", type=int, help="first training seed (the same as first_seed=N)")
@@ -40,21 +34,10 @@ def add(commands: Commands) -> None:
     command.set_defaults(run=_train, kept="what was finished is kept")
 
 
-def _keys() -> Iterator[str]:
-    """Yield a line for each field: the value of a bare `tailgate train`, and the one of a preset that leaves the field out."""
-    from tailgate.training.train import bare, parameters
+def _keys() -> str:
+    from tailgate.training.keys import train_keys
 
-    preset = bare()
-    for field in parameters():
-        used = preset.get(field["name"], field["default"])
-        other = "" if used == field["default"] else f"; in a preset that leaves it out: {_brief(field['default'])}"
-        yield f"  {field['name']:<18} {field['doc']} (default: {_brief(used)}{other})"
-
-
-def _brief(value: object) -> str:
-    """Return a value as JSON; that of a long list or mapping is cut."""
-    text = json.dumps(value)
-    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+    return listed(train_keys())
 
 
 def _train(options: argparse.Namespace) -> int:

@@ -29,7 +29,7 @@ def add(commands: Commands) -> None:
     command.add_argument("--episodes", type=int, default=400, metavar="N", help="episodes per policy and defence (default 400)")
     add_options(command, "--outcome", "--purpose", "--workers")
     command.add_argument("--out", metavar="DIR", help="write rows.jsonl, transfer.json and transfer.png here; resumes")
-    add_options(command, "--json")
+    add_options(command, "--picture", "--json")
     command.set_defaults(run=_transfer)
 
 
@@ -51,7 +51,8 @@ def _transfer(options: argparse.Namespace) -> int:
     if options.out:
         from tailgate.studies.figures import transfer_figure
 
-        for path in write_report(Path(options.out), "transfer", report, transfer_figure(report) if report["entries"] else None):
+        drawn = transfer_figure(report, options.picture) if report["entries"] else None
+        for path in write_report(Path(options.out), "transfer", report, drawn, options.picture):
             print(f"written: {path}", file=sys.stderr)
     return 0 if report["entries"] else 1
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,13 +10,12 @@ import numpy as np
 
 from tailgate.base.errors import InputError
 from tailgate.base.files import write_atomic
-from tailgate.base.plots import canvas
+from tailgate.base.plots import FORMS, canvas, drawn
 from tailgate.core import Array, Model
 
 MANY = 60  # agents: more are drawn on a circle
 ROUNDS = 300  # rounds of the layout
 DPI = 160
-FORMATS = ("png", "svg", "pdf")
 INK, EDGE, NODE, ATTACKED = "#1a1a1a", "#6b7076", "#dcebf5", "#b34700"
 
 
@@ -140,19 +138,13 @@ def _bend(a: int, b: int) -> float:
 def draw_graph(source: object, path: Path, attacked: Collection[int] = (), title: str = "") -> Path:
     """Write the graph of a Model, or of a plant whose agents hear each other, to a .png, .svg or .pdf file; return its path."""
     form = path.suffix.lower().removeprefix(".")
-    if form not in FORMATS:
-        raise InputError("out", str(path), f"a file that ends in {', '.join('.' + name for name in FORMATS)}")
+    if form not in FORMS:
+        raise InputError("out", str(path), f"a file that ends in {', '.join('.' + name for name in FORMS)}")
     if isinstance(source, Model):
         graph, row = source.graph, bool(source.followers.any())
     elif callable(hears := getattr(source, "hears", None)):
         graph, row = hears(), hasattr(source, "topology")
     else:
         raise InputError("graph", type(source).__name__, "a model, or a plant whose agents hear each other")
-    figure, out = graph_figure(graph, None, attacked, row, title), io.BytesIO()
-    from matplotlib import rc_context
-
-    stamp = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[form]  # the same file for the same graph
-    with rc_context({"svg.hashsalt": "tailgate"}):
-        figure.savefig(out, format=form, dpi=DPI, metadata=stamp)
-    write_atomic(path, out.getvalue())
+    write_atomic(path, drawn(graph_figure(graph, None, attacked, row, title), form, dpi=DPI))
     return path

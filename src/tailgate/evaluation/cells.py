@@ -38,6 +38,7 @@ from tailgate.evaluation.rounds import numbered
 from tailgate.evaluation.rows import packed
 from tailgate.evaluation.summary import ENTRY
 from tailgate.play.metrics import METRICS, Function, Own, measure, own_metric
+from tailgate.play.shapes import culprit
 from tailgate.play.trace import Trace, episode_memory, episodes_at_once, rollout
 
 ENGINE = "plain"
@@ -104,8 +105,7 @@ def run_cell(
     attack, attack_entry, _ = component("attack", cell.attack if attack is None else attack)
     place = cell.place(attack, attack_entry.knowledge)
     head = _head(cell, place, defence_entry, attack_entry, identity)
-    rows: list[dict[str, Any]] = []
-    seeds = cell.episodes
+    rows, seeds = list[dict[str, Any]](), cell.episodes
     own = [own_metric(text) for text in cell.metrics]
     try:
         loop = place.loop(defence, defence_entry.uses if uses is None else uses)
@@ -117,7 +117,7 @@ def run_cell(
         try:
             rows += _played(head, chunk, rollout(loop, attack, draws.keys(cell.purpose, chunk)), own)
         except Exception as error:  # a component may raise anything; only its own rows are lost
-            rows += _failed(head, chunk, *_why(error, chunk))
+            rows += _failed(head, chunk, *_why(error, chunk, culprit(error, loop, attack, draws.keys(cell.purpose, chunk))))
     return rows
 
 
@@ -131,14 +131,15 @@ def _played(head: dict[str, Any], seeds: Sequence[int], trace: Trace, own: Seque
     return rows
 
 
-def _why(error: Exception, seeds: Sequence[int] = ()) -> tuple[str, str]:
-    """Return the reason and status of the rows of these seeds, which an error affects."""
+def _why(error: Exception, seeds: Sequence[int] = (), more: str = "") -> tuple[str, str]:
+    """Return the reason and status of the rows of these seeds, which an error affects. more: what else is known."""
     if isinstance(error, DeviceError):
         raise error
     if isinstance(error, NotApplicable):
         return str(error), "skipped"
     row = error.row if isinstance(error, InputError) else None
-    return with_place(error) + (f" (row {row}: seed {seeds[row]})" if row is not None and row < len(seeds) else ""), "error"
+    more = f"row {row}: seed {seeds[row]}" if row is not None and row < len(seeds) else more
+    return with_place(error) + (f" ({more})" if more else ""), "error"
 
 
 def _head(cell: Cell, place: Scenario, defence: Entry, attack: Entry, identity: str) -> dict[str, Any]:
@@ -173,9 +174,8 @@ def _digest(family: Family, text: str, identity: str) -> str:
 
 
 def _failed(head: dict[str, Any], seeds: Iterable[int], reason: str, status: str = "error") -> list[dict[str, Any]]:
-    empty = dict.fromkeys([*METRICS, *head.get("metrics", ())]) | {"trace_hash": None, "decision_hash": None}
-    text = " ".join(reason.split())[:500]
-    return [_own(head) | {"seed": seed, "status": status, "reason": text, **empty} for seed in seeds]
+    empty = dict.fromkeys([*METRICS, *head.get("metrics", ()), "trace_hash", "decision_hash"])
+    return [_own(head) | {"seed": seed, "status": status, "reason": " ".join(reason.split())[:500], **empty} for seed in seeds]
 
 
 def _own(head: dict[str, Any]) -> dict[str, Any]:

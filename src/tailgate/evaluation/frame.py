@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from html import escape
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from tailgate.evaluation.rows import KEYS, Row
@@ -13,6 +15,22 @@ if TYPE_CHECKING:
 
 SHOWN = 40  # cells that a notebook shows
 COLUMNS = ("scenario", "dose", "defence", "attack", "episodes", "collisions", "smallest gap [m]", "largest error")
+
+
+def needs_pandas() -> ModuleType:
+    """Return pandas. Raises ImportError that names the extra where it is missing."""
+    try:
+        import pandas
+    except ImportError as error:
+        raise ImportError("a DataFrame needs pandas: pip install 'tailgate[pandas]'") from error
+    found: ModuleType = pandas
+    return found
+
+
+def html_table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    """Return a table in HTML; its texts stay text."""
+    body = "".join("<tr>{}</tr>".format("".join(f"<td>{escape(text)}</td>" for text in line)) for line in lines)
+    return f"<table><thead><tr>{''.join(f'<th>{escape(name)}</th>' for name in head)}</tr></thead><tbody>{body}</tbody></table>"
 
 
 class Rows(list[Row]):
@@ -35,19 +53,14 @@ class Rows(list[Row]):
         ImportError
             Without pandas (extra `pandas`).
         """
-        try:
-            import pandas
-        except ImportError as error:
-            raise ImportError("a DataFrame needs pandas: pip install 'tailgate[pandas]'") from error
         held = self.summary() if cells else list(self)
-        return pandas.json_normalize(held, max_level=1 if cells else 0)
+        frame: DataFrame = needs_pandas().json_normalize(held, max_level=1 if cells else 0)
+        return frame
 
     def _repr_html_(self) -> str:
         entries = self.summary()
-        lines = ["".join(f"<td>{escape(text)}</td>" for text in _line(entry)) for entry in entries[:SHOWN]]
-        head = "".join(f"<th>{escape(name)}</th>" for name in COLUMNS)
         more = f"<p>and {len(entries) - SHOWN} more cells</p>" if len(entries) > SHOWN else ""
-        return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(f'<tr>{line}</tr>' for line in lines)}</tbody></table>{more}"
+        return f"{html_table(COLUMNS, map(_line, entries[:SHOWN]))}{more}"
 
     def __repr__(self) -> str:
         cells = len({tuple(row[key] for key in KEYS) for row in self})

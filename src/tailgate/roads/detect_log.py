@@ -234,9 +234,9 @@ def _mean(x: Array, where: Array) -> float | None:
     return float(np.mean(x[where])) if where.any() else None
 
 
-def draw(played: Played) -> bytes:
-    """Return a PNG of one piece: gap as recorded, received, believed and smoothed, and the score with its alarms."""
-    from tailgate.base.plots import canvas, png
+def draw(played: Played, form: str = "png") -> bytes:
+    """Return a picture of one piece: gap as recorded, received, believed and smoothed, and the score with its alarms."""
+    from tailgate.base.plots import canvas, drawn
 
     trace, held = played.trace, played.pieces
     hits = (trace.kind != 0).sum(axis=0) + trace.alarm[:, :, 0].sum(axis=0)
@@ -256,7 +256,7 @@ def draw(played: Played) -> bytes:
         ax.legend(fontsize=8, loc="upper right")
     gap.set(ylabel="gap [m]", title=f"{played.recording or 'recording'}: {played.defence}, attack {played.attack}")
     score.set(ylabel="score", xlabel="time [s]", yscale="symlog")
-    return png(figure)
+    return drawn(figure, form)
 
 
 def _shade(ax: Axes, t: Array, on: Array, colour: str, label: str) -> None:

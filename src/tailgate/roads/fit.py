@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tailgate.base.errors import InputError
-from tailgate.base.plots import canvas, png
+from tailgate.base.plots import canvas, drawn
 from tailgate.core import Array
 from tailgate.core.traces import trace
 from tailgate.envs.controllers.production import Gains, ProductionCruise, commanded
@@ -230,8 +230,8 @@ def _with_leader(held: Windows, found: Played) -> Array:
     return np.concatenate([held.speed[..., :1], found.speed], axis=2)
 
 
-def draw(held: dict[str, Any], law: str = "each") -> bytes:
-    """Return a PNG of speeds and gaps on an unseen window, measured and simulated; held: what `fit` returned."""
+def draw(held: dict[str, Any], law: str = "each", form: str = "png") -> bytes:
+    """Return a picture of speeds and gaps on an unseen window, measured and simulated; held: what `fit` returned."""
     settings = Settings(tuple((name, begin) for name, begin in held["traces"]), held["window"])
     _, unseen = windows_of(settings)
     cars = held["laws"][law]["cars"]
@@ -252,4 +252,4 @@ def draw(held: dict[str, Any], law: str = "each") -> bytes:
     axes[0, 0].set_ylabel("speed [m/s]")
     axes[1, 0].set_ylabel("gap [m]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9)
-    return png(figure)
+    return drawn(figure, form)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tailgate.base.plots import MARKERS, canvas, png
+from tailgate.base.plots import MARKERS, canvas, drawn
 
 from .policies import label
 from .timing import TWINS
@@ -32,7 +32,7 @@ def _scale(unit: str) -> float:
     return 100.0 if unit == "0/1" else 1.0
 
 
-def timing_figure(entries: Sequence[dict[str, Any]]) -> bytes:
+def timing_figure(entries: Sequence[dict[str, Any]], form: str = "png") -> bytes:
     """Draw one line per entry and schedule: the outcome with its interval. One panel per outcome."""
     outcomes = list(dict.fromkeys((e["outcome"], e["unit"]) for e in entries))
     heights = [sum((e["outcome"], e["unit"]) == key for e in entries) for key in outcomes]
@@ -56,10 +56,10 @@ def timing_figure(entries: Sequence[dict[str, Any]]) -> bytes:
             ax.set_xlim(-2, 102)
         ax.grid(axis="x", alpha=0.3)
     figure.legend(loc="outside upper center", fontsize=8, ncols=2)
-    return png(figure)
+    return drawn(figure, form)
 
 
-def dose_figure(report: dict[str, Any]) -> bytes:
+def dose_figure(report: dict[str, Any], form: str = "png") -> bytes:
     """Draw one panel per defence, one curve per attack: the measured outcomes with intervals, and the monotone regression."""
     curves = [c for c in report["curves"] if "points" in c]
     defences, attacks = (list(dict.fromkeys(c[key] for c in curves)) for key in ("defence", "attack"))
@@ -97,10 +97,10 @@ def dose_figure(report: dict[str, Any]) -> bytes:
                         linestyle=LINES[i % len(LINES)])[0] for i in range(len(attacks))
     ]  # fmt: skip
     figure.legend(marks, names, loc="outside lower center", fontsize=8, handlelength=4)
-    return png(figure)
+    return drawn(figure, form)
 
 
-def transfer_figure(report: dict[str, Any]) -> bytes:
+def transfer_figure(report: dict[str, Any], form: str = "png") -> bytes:
     """Draw the mean outcome of what was trained on (rows, below a row without an attack) and played on (columns).
 
     Frames: both are the same; stars: flagged. Shades are of the logarithm where the outcome is no share.
@@ -131,7 +131,7 @@ def transfer_figure(report: dict[str, Any]) -> bytes:
     ax.set(xlabel="played on", ylabel="trained on")
     note = "framed: trained on it" + ("; *: better than what was trained on it" if flagged.any() else "")
     ax.set_title(f"{report['scenario']}: {axis_label(report['outcome'], report['unit'])}\n{note}", fontsize=9)
-    return png(figure)
+    return drawn(figure, form)
 
 
 def _frame(column: int, row: int) -> Rectangle:

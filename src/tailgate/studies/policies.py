@@ -226,8 +226,8 @@ def label(text: str, width: int = 30) -> str:
     return textwrap.fill(text.replace(",", ", "), width, break_long_words=False, break_on_hyphens=False)
 
 
-def write_report(directory: Path, name: str, report: dict[str, Any], picture: bytes | None) -> list[Path]:
-    """Write NAME.json and NAME.png; returns their paths."""
+def write_report(directory: Path, name: str, report: dict[str, Any], picture: bytes | None, form: str = "png") -> list[Path]:
+    """Write NAME.json and the picture NAME.png, or that of another form; returns their paths."""
     import json
 
     from tailgate.base.files import writable_directory, write_atomic
@@ -236,6 +236,6 @@ def write_report(directory: Path, name: str, report: dict[str, Any], picture: by
     out = [directory / f"{name}.json"]
     write_atomic(out[0], json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
     if picture is not None:
-        out.append(directory / f"{name}.png")
+        out.append(directory / f"{name}.{form}")
         write_atomic(out[1], picture)
     return out

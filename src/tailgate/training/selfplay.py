@@ -47,6 +47,7 @@ from tailgate.evaluation.stats import Interval, paired_difference, proportion
 from tailgate.training.settings import check_mappings, check_name, mapping, parameters_of, started_with
 from tailgate.training.train import TrainConfig, environment_of
 
+BARE = "selfplay"  # the preset where none is named
 FRESH, DEFENDERS = 1000, 500  # added to the first seed: seeds of best responses and of defenders differ from those of self-play's attackers
 SELECT_EPISODES = 512  # that the best fixed setting and the worst attack are chosen on
 BATCH = 4096  # games side by side
@@ -85,11 +86,19 @@ class GameConfig:
 
 def load_config(source: str | None, overrides: list[str], resume: bool = False) -> GameConfig:
     """Return a preset by name or YAML file (default: selfplay) with `key=value` overrides; with `resume` the run's own configuration."""
-    path = config_path("games", source or "selfplay", "config")
-    config = _checked(override(read_yaml(path, "config"), overrides, GameConfig))
+    config = _checked(override(_preset(source or BARE), overrides, GameConfig))
     if not resume:
         return config
     return _checked(override(started_with(config.directory / "config.json"), overrides, GameConfig))
+
+
+def _preset(source: str) -> dict[str, Any]:
+    return read_yaml(config_path("games", source, "config"), "config")
+
+
+def bare() -> dict[str, Any]:
+    """Return the fields that the preset of a bare `tailgate selfplay` sets; the others have their defaults."""
+    return _preset(BARE)
 
 
 def _checked(data: dict[str, Any]) -> GameConfig:
