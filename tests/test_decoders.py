@@ -91,7 +91,7 @@ def test_the_median():
         assert x[0] == pytest.approx(1.1, abs=1e-7)
 
 
-@pytest.mark.parametrize("s, least", [(0, 40), (1, 40), (2, 38), (3, 30)])
+@pytest.mark.parametrize("s, least", [(0, 40), (1, 40), (2, 38), (3, 33)])
 def test_noise_free_recovery(s, least):
     """Seven sensors of three states, 100 randn on s of them: exact, for s = 3 in most cases; the relaxation may fail. A million times the attack changes nothing."""
     exact = 0
@@ -137,10 +137,18 @@ def test_projected_gradient_recovers_state_and_support():
 
 
 def test_the_error_falls_at_every_trigger():
-    """f after a projection that is triggered may rise, but what triggers it is below (1 - nu) of the one before; more rounds never hurt."""
-    O, _, Y, _ = _window(1, 4, 10.0)
-    energies = [_projected(O, Y, 1, 1e-14, rounds)[2].energy[0, 0] for rounds in (10, 50, 200, 1000, 5000)]
-    assert energies == sorted(energies, reverse=True) and energies[-1] <= 1e-14
+    """f after each projection is not above f after the one before: four windows, looked at after every gradient step."""
+    triggers = 0
+    for _ in range(4):
+        O, _, Y, _ = _window(1, 4, 10.0)
+        energies, projections = [], []
+        for rounds in range(1, 121):
+            found = _projected(O, Y, 1, 1e-14, rounds)[2]
+            energies.append(found.energy[0, 0])
+            projections.append(found.projections[0, 0])
+        assert (np.diff(energies) <= 0.0).all() and (np.diff(projections) <= 1).all()
+        triggers += projections[-1]
+    assert triggers > 20
 
 
 def test_without_attacked_sensors_etpg_is_least_squares_on_the_window(linear_model):
