@@ -16,7 +16,7 @@ PAGES = {  # the packages that a page needs
     "README.md": (), "docs/automata.md": (), "docs/engine.md": (), "docs/guide.md": ("matplotlib", "pandas"), "docs/highway.md": ("highway_env",),
     "docs/lane-keeping.md": (), "docs/rendering.md": ("pygame", "highway_env"), "docs/submissions.md": (), "docs/two-players.md": (),
     "docs/gpu.md": ("torch",), "docs/leaderboard-page.md": (), "docs/replay.md": ("pygame",), "docs/falsification.md": ("optuna",),
-    "docs/logs.md": ("pyarrow",), "docs/scoring.md": (),
+    "docs/logs.md": ("pyarrow",), "docs/scoring.md": (), "docs/literature.md": (),
 }  # fmt: skip
 BEFORE = {  # what the reader of a page has made already, in a small form
     "docs/falsification.md": ["falsify", "kf", "--property", "G[0,60] gap > 20", "--scenario", "braking-v0", "--attack", "none", "--trials", "2", "--out", "found"],
