@@ -236,10 +236,10 @@ def test_without_a_folder_the_most_harmful_attack_is_named_only_if_it_is_no_file
 
     def report(*attacks):
         members = [{"damage": damage, "attack": attack} for damage, attack in attacks]
-        return {"defence": "kf", "cells": [{"scenario": "braking-v0", "dose": 4, "members": members}]}
+        return {"defence": "kf", "episodes": 400, "cells": [{"scenario": "braking-v0", "dose": 4, "members": members}]}
 
     script, file = (0.4, "fdi:value=3"), (0.9, "policy:path=x.json")
-    assert "--attack policy:path=x.json" in _again(report(script, file), "quick-v0", kept=True)
+    assert "--attack policy:path=x.json --seeds 400 --out" in _again(report(script, file), "quick-v0", kept=True)
     assert _again(report(script, file), "quick-v0", kept=False) == "the most harmful one (90.0% in braking-v0, dose 4) is a file, and no file was kept: --out DIR keeps them"
     assert "--attack fdi:value=3" in _again(report((0.9, "policy:path=x.json"), (0.9, "fdi:value=3")), "quick-v0", kept=False)
     assert "--attack fdi:value=3" in _again(report(script), "quick-v0", kept=False) and _again(report((0.0, None)), "quick-v0", kept=False) == ""

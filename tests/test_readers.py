@@ -62,6 +62,12 @@ def test_jitter_is_interpolated_and_short_segments_are_dropped():
     assert found.repairs["samples interpolated to even times"] == found.samples
 
 
+def test_a_unit_of_another_kind_is_refused():
+    for text, wanted in (("gap=d:km/h", "ft, km, m"), ("gap=d:s", "ft, km, m"), ("t=time:m", "ms, ns, s, us"), ("speed=v:ft", "ft/s, km/h, m/s, mph")):
+        with pytest.raises(InputError, match=rf"--map: unit of {text.partition('=')[0]}: got '{text.rpartition(':')[2]}'.*{wanted}"):
+            mapping_of([text])
+
+
 def test_a_mapping_is_checked():
     assert mapping_of(["speed=v:km/h", "gap=d"]) == (("speed", "v", "km/h"), ("gap", "d", ""))
     for text, words in (("speed", "WHAT=COLUMN"), ("velocity=v", "--map: got 'velocity'"), ("gap=", "WHAT=COLUMN")):

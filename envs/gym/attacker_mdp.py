@@ -146,7 +146,8 @@ class Seat:
         for key in options:
             if key not in known:
                 hint = f"threat={{{key!r}: {options[key]!r}}}, or " if key in fields_of(ThreatModel) else ""
-                raise UnknownArgument(key, [*known, "scenario", "defence", "threat", "knowledge", "frames"], hint)
+                others = ("scenario", "defence", "threat", "knowledge", "frames", "engine", "render_mode", "viewer", "size")
+                raise UnknownArgument(key, [*known, *others], hint)
         for key in threat:
             if key not in fields_of(ThreatModel):
                 raise unknown("threat: unknown field", key, fields_of(ThreatModel))

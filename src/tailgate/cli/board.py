@@ -51,7 +51,7 @@ def add(actions: Commands) -> None:
     add_options(page, "--title", "--no-replays")
     page.set_defaults(run=_page)
     head = actions.add_parser("head", help="print the head of a board as a Markdown table")
-    head.add_argument("board", metavar="FILE", help="board.json, or board.json.xz")
+    head.add_argument("board", metavar="FILE", help="board.json, board.json.xz, or the name of a published board")
     head.add_argument("--most", type=int, metavar="N", help="print at most N defences, the first in the order of the page (default: all)")
     head.set_defaults(run=_head)
 
@@ -131,7 +131,7 @@ def _head(options: argparse.Namespace) -> int:
     from tailgate.board.files import load
     from tailgate.board.head import markdown
 
-    board = load(Path(options.board))
+    board = load(options.board)
     if options.most is not None:
         sizes.check("most", options.most)
     print(markdown(board, options.most), end="")
@@ -143,7 +143,7 @@ def _page(options: argparse.Namespace) -> int:
     from tailgate.board.files import load
     from tailgate.site.build import build_site
 
-    boards = [load(Path(name)) for name in options.boards]
+    boards = [load(name) for name in options.boards]
     measured = [Attachments.of(Path(name)) for name in options.boards]
     page = build_site(boards, Path(options.out), title=options.title, replays=not options.no_replays, measured=measured)
     print(page)

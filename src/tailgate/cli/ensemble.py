@@ -72,6 +72,7 @@ def _again(report: dict[str, Any], suite: str, kept: bool) -> str:
         return f"the most harmful one ({damage:.1%} in {where}) is a file, and no file was kept: --out DIR keeps them"
     words = ["tailgate", "evaluate", "--suite", suite, "--scenario", cell["scenario"]]
     words += ["--dose", "none" if cell["dose"] is None else str(cell["dose"]), "--defence", report["defence"], "--attack", attack]
+    words += ["--seeds", str(report["episodes"])]
     return f"to play the most harmful one again: {shlex.join([*words, '--out', 'rows.jsonl'])}"
 
 

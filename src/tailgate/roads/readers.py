@@ -28,11 +28,10 @@ from tailgate.roads.fcd import read_fcd
 from tailgate.roads.recording import MOST, Raw, Recording, checked
 
 FORMATS = ("openacc", "ultra-av", "comma2k19", "sumo-fcd", "veremi", "csv", "trace")
-UNITS = {
-    "m": 1.0, "km": 1000.0, "ft": 0.3048, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "m/s": 1.0, "km/h": 1.0 / 3.6, "mph": 0.44704,
-    "ft/s": 0.3048,
-}  # fmt: skip
-WANTED = ("t", "gap", "speed", "relative_speed", "lead_speed")
+TIMES, LENGTHS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}, {"m": 1.0, "km": 1000.0, "ft": 0.3048}
+SPEEDS = {"m/s": 1.0, "km/h": 1.0 / 3.6, "mph": 0.44704, "ft/s": 0.3048}
+UNITS = TIMES | LENGTHS | SPEEDS
+WANTED = {"t": TIMES, "gap": LENGTHS, "speed": SPEEDS, "relative_speed": SPEEDS, "lead_speed": SPEEDS}  # and their units
 HEADER = 20  # lines before the header of an OpenACC file, at most
 LENGTH = 5.0  # of a vehicle whose length nobody tells [m]
 
@@ -57,6 +56,8 @@ def mapping_of(texts: Sequence[str]) -> tuple[tuple[str, str, str], ...]:
             raise InputError("--map", text, "WHAT=COLUMN or WHAT=COLUMN:UNIT, such as speed=v_ego:km/h")
         if what not in WANTED:
             raise unknown("--map", what, WANTED)
+        if unit and unit not in WANTED[what]:
+            raise unknown(f"--map: unit of {what}", unit, WANTED[what])
         out.append((what, column, unit))
     return tuple(out)
 
