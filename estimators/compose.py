@@ -250,10 +250,10 @@ def quiet(verdict: Verdict) -> Array:
 
 @register("mitigation", "accept_all")
 @dataclass(frozen=True)
-class AcceptAll(Reaction):
+class AcceptAll(Reaction[None, X]):
     """Uses whatever was received."""
 
-    def choose(self, plan: ReactionPlan, state: None, verdict: Verdict, received: Received) -> tuple[None, Decision]:
+    def choose(self, plan: ReactionPlan[X], state: None, verdict: Verdict, received: Received) -> tuple[None, Decision]:
         return None, Decision(received.valid, quiet(verdict))
 
 

@@ -331,20 +331,6 @@ def test_watermark_raises_the_statistic_under_replay():
         assert abs(held.mean() - mean) < 4.0 * held.std() / np.sqrt(batch)
 
 
-def test_a_watermark_is_a_part_of_the_command_and_known_to_the_filter():
-    """The watermark's variance adds to that of the command; the clean score stays as it is; sd = 0 gives the plain filter."""
-    place = load_scenario("stop-and-go-v0").with_threat(kinds=("replay",), knowledge="black")
-    plain = tailgate.make_defence("composed", detector="windowed_chi2", mitigation="accept_all")
-    known, quiet, loud = (
-        rollout(place.loop(d), tailgate.make_attack("none"), keys("train", range(50)))
-        for d in (plain, tailgate.make_defence("watermark", sd=0.0), tailgate.make_defence("watermark", sd=0.3))
-    )
-    np.testing.assert_array_equal(quiet.control, known.control)
-    added = loud.control - known.control
-    assert np.std(added[1:3]) == pytest.approx(0.3, rel=0.3)
-    assert loud.score[loud.live].mean() == pytest.approx(known.score[known.live].mean(), rel=0.02)
-
-
 def test_the_linear_program_is_exact():
     """Its value is that of the dual program, and in many windows below that of 200 rounds; the median is exact."""
     from scipy.optimize import linprog

@@ -8,6 +8,7 @@ from scipy import linalg, stats
 
 import tailgate
 from tailgate.base.errors import InputError
+from tailgate.core.draws import keys
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
 from tailgate.estimators.sparse_attacks.kf_bank import KalmanBank
@@ -201,12 +202,26 @@ def test_etpg_alarms_as_seldom_as_it_says_without_process_noise(linear_model):
 def test_a_watermark_marks_actuators_only():
     """In a lane the curvature is a known input and no actuator. The replay that looks like the road shows with the watermark."""
     place = load_scenario("lane-keeping-v0").with_threat(kinds=("replay",), budget=None, targets=("lane_offset", "lane_heading", "yaw_rate"))
-    held, shares = tailgate.core.draws.keys("report", range(40)), []
+    held, shares = keys("report", range(40)), []
     for sd in (0.0, 0.01):
         loop = place.loop(Spec("defence", f"watermark:sd={sd}").make())
         played = rollout(loop, Spec("attack", "replay:start_step=200,length=50,window=50").make(), held)
         shares.append(played.alarm[205:249].any(axis=0).mean())
     assert shares[0] < 0.5 and shares[1] > 0.9
+
+
+def test_a_watermark_is_a_part_of_the_command_and_known_to_the_filter():
+    """The watermark's variance adds to that of the command; the clean score stays as it is; sd = 0 gives the plain filter."""
+    place = load_scenario("stop-and-go-v0").with_threat(kinds=("replay",), knowledge="black")
+    plain = tailgate.make_defence("composed", detector="windowed_chi2", mitigation="accept_all")
+    known, quiet, loud = (
+        rollout(place.loop(d), tailgate.make_attack("none"), keys("train", range(50)))
+        for d in (plain, tailgate.make_defence("watermark", sd=0.0), tailgate.make_defence("watermark", sd=0.3))
+    )
+    np.testing.assert_array_equal(quiet.control, known.control)
+    added = loud.control - known.control
+    assert np.std(added[1:3]) == pytest.approx(0.3, rel=0.3)
+    assert loud.score[loud.live].mean() == pytest.approx(known.score[known.live].mean(), rel=0.02)
 
 
 def test_the_price_of_a_watermark_is_that_of_a_simulation():

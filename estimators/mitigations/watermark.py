@@ -18,24 +18,20 @@ import numpy as np
 from tailgate.core import Array, Estimate, Model, NonNegative, Positive, PositiveCount, Received, param
 from tailgate.core.draws import Draws
 from tailgate.core.registry import register
-from tailgate.estimators.compose import Composed, ComposedPlan, ComposedState, Reaction, ReactionPlan, quiet
+from tailgate.estimators.compose import AcceptAll, Composed, ComposedPlan, ComposedState
 from tailgate.estimators.detectors.sequential import WindowedChiSquare
 from tailgate.estimators.filters.kalman import KalmanFilter
-from tailgate.estimators.parts import Decision, Detector, Filter, Mitigation, Verdict
+from tailgate.estimators.parts import Detector, Filter, Mitigation
 
 
 @dataclass(frozen=True)
-class Marking(Reaction[None, Array]):
-    """Uses whatever was received; holds the watermark's standard deviation for each actuator (m,)."""
+class Marking(AcceptAll[Array]):
+    """Holds the watermark's standard deviation for each actuator (m,)."""
 
     sd: NonNegative = param(0.3, "standard deviation of what is added to the command [unit of the actuator]")
 
     def constants(self, model: Model) -> Array:
         return np.full(len(model.actuators), self.sd)
-
-    def choose(self, plan: ReactionPlan[Array], state: None, verdict: Verdict, received: Received) -> tuple[None, Decision]:
-        return None, Decision(received.valid, quiet(verdict))
-
 
 @register(
     "defence", "watermark",
