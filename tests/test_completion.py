@@ -51,3 +51,11 @@ def test_quiet_shows_no_progress(capsys: pytest.CaptureFixture[str]) -> None:
         shown = capsys.readouterr()
         assert shown.out == loud.out and "playing" in loud.err and not shown.err
     assert main([*line, "--quiet", "--dose", "x"]) == 2 and "dose" in capsys.readouterr().err
+
+
+def test_a_command_line_is_read_before_anything_heavy_is_loaded() -> None:
+    """A key press waits for it, and so does every command."""
+    code = "import sys; from tailgate.cli.command_line import _parser; _parser(); print(sorted({name.partition('.')[0] for name in sys.modules}))"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert "'numpy'" in found
+    assert not [name for name in ("scipy", "torch", "matplotlib", "llvmlite", "cvxpy", "highway_env", "cmaes") if f"'{name}'" in found]

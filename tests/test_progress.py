@@ -1,8 +1,10 @@
 """Progress without a terminal: lines at each tenth, with the time so far and the time left; searches in other processes are followed."""
 
+import contextlib
 import io
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -68,6 +70,48 @@ def test_searches_in_other_processes_are_followed(tmp_path: Path, monkeypatch: p
     with standard._followed([note, tmp_path / "none"], told.append):
         assert partial(standard._noted, search)(job, tmp_path) == {}
     assert seen == [b"25"] and 25 in told and not note.exists()
+
+
+def _job(number: int) -> Any:
+    place = SimpleNamespace(scenario="road", dose=number)
+    return SimpleNamespace(name=str(number), arena=place)
+
+
+def _found(*_: object) -> dict[str, Any]:
+    return {"scenario": "road", "members": [], "listed": None}
+
+
+def test_a_search_that_ends_takes_nothing_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The note of a search is gone before its result counts, and one of a killed run says nothing."""
+    told: list[int] = []
+    jobs = [_job(0), _job(1)]
+
+    def each(*_: object) -> Any:
+        assert not standard._note(jobs[1], tmp_path).exists()
+        follow[0](150)
+        follow[0](60)  # the first search has ended, and its result is on the way
+        yield 0, _found()
+        yield 1, _found()
+
+    follow: list[Any] = []
+    monkeypatch.setattr(standard, "_followed", lambda _, update: follow.append(update) or contextlib.nullcontext())
+    monkeypatch.setattr(standard, "each", each)
+    (tmp_path / "searches").mkdir()
+    standard._note(jobs[1], tmp_path).write_bytes(b"90")
+    standard.searched(jobs, tmp_path, 2, lambda _, done, total, text: told.append(done) or told.append(total))
+    assert told == [0, 200, 150, 200, 150, 200, 150, 200, 200, 200]
+
+
+def test_searches_in_turn_count_together(tmp_path: Path) -> None:
+    told = []
+
+    def one(job: Any, _: Path, tell: Any) -> dict[str, Any]:
+        tell(1, 4, "the best so far", 0.0)
+        return _found()
+
+    standard.searched([_job(0), _job(1)], tmp_path, 1, lambda *words: told.append(words), one=one)
+    assert told[1] == ("searches", 25, 200, "0 of 2, road, dose 0: the best so far")
+    assert [words[1] for words in told] == [0, 25, 100, 125, 200]
 
 
 def test_a_folder_that_takes_no_notes_ends_no_search(tmp_path: Path) -> None:

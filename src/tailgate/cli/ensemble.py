@@ -9,7 +9,7 @@ from typing import Any
 
 from tailgate.base.progress import lasting
 from tailgate.cli.shared import Commands, add_options, own_classes, say, show, table, tell, working
-from tailgate.ensemble.members import BUDGETS
+from tailgate.training.adaptive import SIZES
 
 
 def add(commands: Commands) -> None:
@@ -23,7 +23,7 @@ def add(commands: Commands) -> None:
     command.add_argument("defence", metavar="NAME", help="defence to attack; a class: module:Class, or bwrap/module:Class")
     command.add_argument("--suite", default="quick-v0", metavar="NAME", help="suite by name or YAML file (default: quick-v0)")
     add_options(command, "--scenario", "--dose")
-    command.add_argument("--budget", default="standard", metavar="SIZE", help=f"{' or '.join(BUDGETS)} (default: standard)")
+    command.add_argument("--budget", default="standard", metavar="SIZE", help=f"{' or '.join(SIZES)} (default: standard)")
     command.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the search (default 0)")
     command.add_argument("--episodes", type=int, default=400, metavar="N", help="report episodes per comparison (default 400)")
     command.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2); change no result")

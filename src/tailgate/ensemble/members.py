@@ -144,17 +144,18 @@ class Member(NamedTuple):
     name: str
     knowledge: str
     find: Callable[[Hunt], list[str]]  # attacks as on the command line
-    learns: bool = False  # takes most of the time of a search
+    share: int  # of the time of a search, about, in percent
+    learns: bool = False
 
 
 MEMBERS = (
-    Member("scripts", "black", _scripts),
-    Member("programs", "black", _programs),
-    Member("transfer", "black", _transfer),
-    Member("networks", "black", lambda hunt: _policies(hunt, "black"), learns=True),
-    Member("grey networks", "grey", lambda hunt: _policies(hunt, "grey"), learns=True),
-    Member("white box", "white", _white_box),
-    Member("gradient", "white", _gradient, learns=True),
+    Member("scripts", "black", _scripts, 4),
+    Member("programs", "black", _programs, 4),
+    Member("transfer", "black", _transfer, 2),
+    Member("networks", "black", lambda hunt: _policies(hunt, "black"), 40, learns=True),
+    Member("grey networks", "grey", lambda hunt: _policies(hunt, "grey"), 20, learns=True),
+    Member("white box", "white", _white_box, 2),
+    Member("gradient", "white", _gradient, 28, learns=True),
 )
 
 
@@ -167,9 +168,11 @@ class Harvest(NamedTuple):
     why: str = ""
 
 
-def _share(tell: Tell, number: int, members: int) -> Tell:
+def _share(tell: Tell, members: Sequence[Member], number: int) -> Tell:
     """Return a function that counts the steps of one member as a part of the whole search, in percent."""
-    return lambda done, total, text, mean: tell(100 * (number * total + done) // (members * total), 100, text, mean)
+    before, whole = (sum(member.share for member in some) for some in (members[:number], members))
+    own = members[number].share
+    return lambda done, total, text, mean: tell(int(100 * (before + own * done / total) / whole), 100, text, mean)
 
 
 def members_of(hunt: Hunt) -> list[Member]:
@@ -185,7 +188,7 @@ def harvest(hunt: Hunt, before: Sequence[Harvest] = (), after: Callable[[list[Ha
     out, tell = list(before), hunt.tell
     searching = members_of(hunt)
     for number, member in enumerate(searching[len(out) :], len(out)):
-        hunt.tell = None if tell is None else _share(tell, number, len(searching))
+        hunt.tell = None if tell is None else _share(tell, searching, number)
         found, why = [], ""
         try:
             found = hunt.arena.best(member.find(hunt))

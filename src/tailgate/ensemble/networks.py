@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from cmaes import SepCMA
 
 from tailgate.agents.learners.cem import Shape, imitation, lean, scales
 from tailgate.agents.learners.learning import header_of
@@ -114,6 +113,8 @@ class Evolution:
     """One start: a distribution of weights that moves towards what does more harm."""
 
     def __init__(self, arena: Arena, knowledge: str, start: Start, population: int, seed: int) -> None:
+        from cmaes import SepCMA  # imports scipy's statistics
+
         self.arena, self.start, self.attack, self.loop = arena, start, PolicyAttack(), arena.seat(knowledge)
         self.episode = 0
         network = start.plan.network

@@ -148,29 +148,32 @@ def searched(
     left = [i for i in range(len(jobs)) if i not in done]
     if announce is not None and left:
         announce(expected([jobs[i] for i in left], workers))
-    update("searches", 100 * len(done), 100 * len(jobs), f"{len(done)} of {len(jobs)}")
+    shown = 0
+
+    def show(percent: int = 0, text: str = "") -> None:
+        nonlocal shown  # a search that ends removes its note before it counts as done
+        shown = max(shown, 100 * len(done) + percent)
+        update("searches", shown, 100 * len(jobs), f"{len(done)} of {len(jobs)}{text}")
 
     def finish(number: int, result: dict[str, Any]) -> None:
         done[number] = result
         write_atomic(_file(jobs[number], folder), json.dumps(result, indent=1).encode() + b"\n")
         _journal(jobs[number], folder).unlink(missing_ok=True)
         best = _best(result)
-        text = f", {result['scenario']}: {best['damage']:.0%} by {best['attack']}" if best else ""
-        update("searches", 100 * len(done), 100 * len(jobs), f"{len(done)} of {len(jobs)}{text}")
+        show(text=f", {result['scenario']}: {best['damage']:.0%} by {best['attack']}" if best else "")
 
+    show()
     if apart(workers, len(left)):
         notes = [_note(jobs[i], folder) for i in left]
-
-        def follow(percent: int) -> None:
-            update("searches", 100 * len(done) + percent, 100 * len(jobs), f"{len(done)} of {len(jobs)}")
-
-        with _followed(notes, follow):
+        for note in notes:
+            note.unlink(missing_ok=True)  # of a run that was killed
+        with _followed(notes, show):
             for number, result in each(partial(_noted, one), [(jobs[i], folder) for i in left], workers):
                 finish(left[number], result)
     else:
         for i in left:
-            label = f"{jobs[i].arena.scenario}, dose {jobs[i].arena.dose}"
-            finish(i, one(jobs[i], folder, lambda n, of, text, mean, label=label: update(label, n, of, text)))  # type: ignore[misc]
+            place = f", {jobs[i].arena.scenario}, dose {jobs[i].arena.dose}: "
+            finish(i, one(jobs[i], folder, lambda n, of, text, mean, place=place: show(100 * n // of, place + text)))  # type: ignore[misc]
     return [done[i] for i in range(len(jobs))]
 
 
