@@ -224,8 +224,12 @@ def small_ensemble(monkeypatch):
 
 def shrink_ensemble(monkeypatch):
     """Make the standard attack ensemble small until the patch is undone."""
+    from tailgate.agents.policy.zoo import zoo_names
     from tailgate.ensemble import members, networks, standard
     from tailgate.ensemble import search as searching
+
+    few = zoo_names()[::5]
+    monkeypatch.setattr(networks, "zoo_names", lambda: few)
 
     effort = searching.Effort(64, 3)
     budget = members.Budget(effort, effort, 6, ((2, 8), (1, 8)), members.Pace(16, 1, 1, 8))

@@ -212,8 +212,8 @@ def test_an_honest_detection_board_comes_out_equal(board: Data) -> None:
             del item["low"], item["high"]
     report = check_detection(board, defences=["chi2_kf", "kf"])
     assert report["counts"] == {"equal": 2 * (2 * 2 * 2 + 2 + 2 * 2), "differs": 0, "unchecked": 0} and report["findings"] == report["reasons"] == []
-    drawn = [check_detection(board, sample=1, sample_seed=seed)["entries"][0]["defence"] for seed in range(4)]
-    assert len(set(drawn)) > 1
+    drawn = [check_detection(board, sample=1, sample_seed=seed)["entries"][0]["defence"] for seed in (0, 1)]
+    assert len(set(drawn)) == 2
 
 
 def test_an_altered_figure_is_found(board: Data, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,8 +6,9 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -61,13 +62,12 @@ def test_the_new_defence_plays_as_an_object(package: Path, monkeypatch: pytest.M
     sys.modules.pop("mydefence", None)
 
 
-def test_the_radar_example_challenges_and_hears(package: Path) -> None:
+def test_the_radar_example_challenges_and_hears(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A fifth of the steps are muted, and an attacker who radiates is heard."""
     (package / "myradar.py").write_text(_blocks("docs/new-defence.md", "python")[2], encoding="utf-8")
-    command = [sys.executable, "-m", "tailgate", "evaluate", "--scenario", "radar-following-v0", "--defence", "myradar:Listening"]
-    command += ["--attack", "none", "--attack", "echo_delay:start_step=60", "--seeds", "20", "--out", "rows.jsonl"]
-    done = subprocess.run(command, cwd=package, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    monkeypatch.chdir(package)
+    command = ["evaluate", "--scenario", "radar-following-v0", "--defence", "myradar:Listening", "--attack", "none"]
+    assert main([*command, "--attack", "echo_delay:start_step=60", "--seeds", "20", "--out", "rows.jsonl"]) == 0
     rows = [json.loads(line) for line in (package / "rows.jsonl").read_text(encoding="utf-8").splitlines()]
     assert {row["status"] for row in rows} == {"ok"} and {row["dose"] for row in rows} == {10}  # the scenario's own
     clean, attacked = ([row for row in rows if (row["attack"] == "none") == quiet] for quiet in (True, False))
@@ -140,27 +140,35 @@ def test_the_scenario_of_the_documentation_plays(tmp_path: Path) -> None:
     assert trace.lead_speed[149 - 2, 0, 0] == pytest.approx(5.0, abs=0.35) and not trace.collided.any()
 
 
-def _evaluated(folder: Path, *arguments: str) -> list[dict[str, object]]:
-    command = [sys.executable, "-m", "tailgate", "evaluate", "--scenario", "thesis-ch4-v0", "--dose", "none", "--seeds", "4", "--json"]
-    done = subprocess.run([*command, *arguments], cwd=folder, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return list(json.loads(done.stdout))
+Evaluated = Callable[..., list[dict[str, Any]]]
 
 
-def test_the_detector_of_the_documentation_plays(tmp_path: Path) -> None:
+@pytest.fixture
+def evaluated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Evaluated:
+    """Return a function that evaluates with these options where modules of one's own lie."""
+
+    def called(*arguments: str) -> list[dict[str, Any]]:
+        monkeypatch.chdir(tmp_path)
+        assert main(["evaluate", "--scenario", "thesis-ch4-v0", "--dose", "none", "--seeds", "4", "--json", *arguments]) == 0
+        return list(json.loads(capsys.readouterr().out))
+
+    return called
+
+
+def test_the_detector_of_the_documentation_plays(tmp_path: Path, evaluated: Evaluated) -> None:
     """As a part named on the command line, attacked through its own gate as well."""
     (tmp_path / "mydetector.py").write_text(_blocks("docs/detectors.md", "python")[0], encoding="utf-8")
     guard = "composed:detector=mydetector:Leaky,detector.threshold=40"
-    quiet, stealth = _evaluated(tmp_path, "--defence", guard, "--attack", "none", "--attack", "stealth")
+    quiet, stealth = evaluated("--defence", guard, "--attack", "none", "--attack", "stealth")
     assert quiet["n"] == stealth["n"] == 4
-    assert stealth["alarm_onsets"]["median"] == 0.0 and stealth["max_error"]["median"] > 20.0  # type: ignore[index]
+    assert stealth["alarm_onsets"]["median"] == 0.0 and stealth["max_error"]["median"] > 20.0
 
 
-def test_the_adapted_filter_of_the_documentation_plays(tmp_path: Path) -> None:
+def test_the_adapted_filter_of_the_documentation_plays(tmp_path: Path, evaluated: Evaluated) -> None:
     """filterpy's fading-memory filter, named as module:Class with its parameter."""
     (tmp_path / "myfilter.py").write_text(_blocks("docs/new-defence.md", "python")[3], encoding="utf-8")
-    (entry,) = _evaluated(tmp_path, "--defence", "myfilter:Fading:alpha=1.05", "--attack", "none")
-    assert entry["n"] == 4 and 0.3 < entry["rmse_position"]["median"] < 1.5  # type: ignore[index]
+    (entry,) = evaluated("--defence", "myfilter:Fading:alpha=1.05", "--attack", "none")
+    assert entry["n"] == 4 and 0.3 < entry["rmse_position"]["median"] < 1.5
 
 
 def test_the_kalman_filter_of_the_documentation_is_the_built_in_one(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
