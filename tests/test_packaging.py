@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from tailgate.base.version import ALIKE
+from tailgate.board.export import TITLE
 from tailgate.board.files import load
 
 ROOT = Path(__file__).parents[1]
@@ -57,6 +58,8 @@ def test_one_version_is_said_everywhere() -> None:
     (version, date), own = released[1], CONFIG["project"]["version"]
     assert released[0] == ("Unreleased", "") and version == own and date
     assert f"\nversion: {own}\n" in cited and f"\ndate-released: {date}\n" in cited
+    entry = (ROOT / "docs/index.md").read_text(encoding="utf-8").partition("@software{")[2].partition("\n}")[0]
+    assert f"version = {{{own}}}" in entry and f"year = {{{date[:4]}}}" in entry and f"title = {{{TITLE}}}" in entry and TITLE in cited
     assert own not in ALIKE and ALIKE[-1] == released[2][0]
 
 
