@@ -85,6 +85,13 @@ def turned(x: Any) -> Any:
     return np.swapaxes(x, -1, -2) + x[..., ::-1] * x[:, ::-1]
 
 
+def rings(s: Row) -> Any:
+    """Rings of nine numbers, of which each row and agent reads and writes another place, and all agents of a row the same one."""
+    own, common = s["n"][..., 0].astype(np.int64) % N, s["n"][:, :1, :1, 1].astype(np.int64) % N
+    ring = num.put(num.put(s["P"], own, s["x"]), common, -s["x"])
+    return np.stack([num.pick(ring, own), num.pick(ring, common), num.pick(s["Z"], num.ring_next(own, N))], axis=-1)
+
+
 def many(x: Any) -> Any:
     return (x + 1.0) * (x - 1.0) * (x + 2.0) * (x - 2.0) * (x + 3.0)
 
@@ -117,6 +124,7 @@ CASES: dict[str, Callable[[Row], Any]] = {
     "steady": steady,
     "read in other places": lambda s: turned(s["P"] * 2.0 - s["Z"]),
     "read by many": lambda s: many(s["P"] * 2.0),
+    "rings": rings,
 }  # fmt: skip
 
 

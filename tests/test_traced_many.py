@@ -265,3 +265,9 @@ def test_a_single_environment_is_a_batch_of_one(action, scenario, reward):
         assert [type(value) for value in first] == [type(value) for value in second] and first[1:4] == second[1:4]
         assert all(np.array_equal(value, second[4][key]) for key, value in first[4].items())
         over = first[2] or first[3]
+
+
+def test_what_replays_read_is_searched_in_loops():
+    """Thirty rings of fifty samples: one by one they would be ten times as many numbers, and take half a minute to compile."""
+    program = commanded(loop_of("platoon-v2v-v0", "kf", "replay")[0]).program
+    assert program.size["nodes"] < 5000 and program.size["branches"] < 50

@@ -221,9 +221,11 @@ class Channel:
         recording = Recording(plan.recorded, *(part[:, None, None] for part in (state.taped, state.anchor, state.played)))
         known = [kind for kind in np.flatnonzero(plan.kinds).tolist() if not (EFFECTS[kind].over_air or EFFECTS[kind].inside)]
         for kind in num.present(np.where(target.any(axis=(1, 2)), command.kind, NONE), known):
-            hit, effect = target & (command.kind == kind)[:, None, None], EFFECTS[kind]
+            now, effect = (command.kind == kind)[:, None, None], EFFECTS[kind]
+            hit = target & now
             given = np.where(hit, value, 1.0) if effect.recorded else value
-            out = np.where(hit, effect.reads(sent, given, memory, recording), out)
+            read = np.where(hit, effect.reads(sent, given, memory, recording), out)
+            out = np.where(now, read, out) if effect.recorded else read  # one mask of all wires: traced code skips the search of the rings
         return out
 
     def _keep(self, plan: ChannelPlan, state: ChannelState, memory: Memory, sent: Array, hit: Array) -> Memory:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from tailgate.engine.array import Traced, chosen, each, lifted, result_type, shared_batch, typed
+from tailgate.engine.buffers import boxed, swept, wide
 from tailgate.engine.graph import Graph, Node
 from tailgate.engine.operations import Array, ArrayLike, Axis, DTypeLike, Shape
 from tailgate.engine.untraceable import Untraceable
@@ -195,6 +196,29 @@ def gathered(table: ArrayLike, index: Array) -> Traced:
         one: Node = index.nodes.item(place)
         nodes[place] = [graph.gather(list(column), one) for column in columns]
     return Traced(graph, nodes.reshape(*index.shape, *held.shape[1:]), held.dtype, index.batch)
+
+
+def picked(ring: Traced, place: ArrayLike) -> Array:
+    """Return ring[..., place] of a ring (B, ..., L), for places that broadcast to (B, ...); of a large ring it is a loop."""
+    graph, lead = ring.graph, ring.shape[:-1]
+    if not wide(graph, ring.nodes) or int(np.prod(lead)) == 1:
+        return _halved(ring, place, 0, ring.shape[-1])
+
+    def one(nodes: Array, node: Node) -> Node:
+        those, here = Traced(graph, nodes[None], ring.dtype, 0), Traced(graph, boxed(node)[None], np.dtype(np.int64), 0)
+        found: Node = lifted(graph, _halved(those, here, 0, nodes.size)).nodes[0]
+        return found
+
+    places = np.broadcast_to(lifted(graph, place).nodes, lead)
+    return Traced(graph, swept(graph, one, lead, [ring.nodes, places]), ring.dtype, ring.batch)
+
+
+def _halved(ring: Array, place: ArrayLike, first: int, last: int) -> Array:
+    """Return ring[..., place] for places from `first` up to `last`, by halves: few selects are left where episodes read one place."""
+    if last - first == 1:
+        return ring[..., first]
+    middle = (first + last) // 2
+    return np.where(np.less(place, middle), _halved(ring, place, first, middle), _halved(ring, place, middle, last))
 
 
 # -- constructors

@@ -9,7 +9,7 @@ import numpy as np
 
 from tailgate.base.errors import InputError
 from tailgate.engine.array import Traced
-from tailgate.engine.functions import gathered
+from tailgate.engine.functions import gathered, picked
 from tailgate.engine.loops import chosen_apart
 from tailgate.engine.operations import Array, Mask
 
@@ -61,16 +61,13 @@ def pick(ring: Array, place: Array) -> Array:
         if ring.ndim == 2 and np.ndim(place) == 1:
             return ring[np.arange(len(ring)), place]
         return np.take_along_axis(ring, np.broadcast_to(place, ring.shape[:-1])[..., None], axis=-1)[..., 0]
-    out: Array = ring[..., 0]
-    for i in range(1, ring.shape[-1]):
-        out = np.where(place == i, ring[..., i], out)
-    return out
+    return picked(ring, place)
 
 
 def put(ring: Array, place: Array, value: Array) -> Array:
     """Return the ring (B, ..., L) with `value` (B, ...) at `place`, which broadcasts to (B, ...)."""
     if isinstance(ring, Traced):
-        return np.stack([np.where(place == i, value, ring[..., i]) for i in range(ring.shape[-1])], axis=-1)
+        return np.where(place[..., None] == np.arange(ring.shape[-1]), value[..., None], ring)
     out = ring.copy(order="K")
     if ring.ndim == 2 and np.ndim(place) == 1:
         out[np.arange(len(ring)), place] = value
