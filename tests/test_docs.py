@@ -145,7 +145,7 @@ Evaluated = Callable[..., list[dict[str, Any]]]
 
 @pytest.fixture
 def evaluated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Evaluated:
-    """Return a function that evaluates with these options where modules of one's own lie."""
+    """Return a function that runs `tailgate evaluate` with these options in the folder of the test."""
 
     def called(*arguments: str) -> list[dict[str, Any]]:
         monkeypatch.chdir(tmp_path)
