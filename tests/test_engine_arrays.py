@@ -11,9 +11,9 @@ import pytest
 from tailgate import num
 from tailgate.engine import functions
 from tailgate.engine.array import Traced
-from tailgate.engine.graph import Graph
+from tailgate.engine.graph import Graph, Node
 from tailgate.engine.operations import FLOAT
-from tailgate.engine.parameters import lifted
+from tailgate.engine.parameters import Reading, lifted
 from tailgate.engine.program import Call, Program, State
 from tailgate.engine.tracing import traced
 from tailgate.engine.untraceable import Untraceable
@@ -266,3 +266,23 @@ def test_parameters_are_no_part_of_the_code() -> None:
         call = Call(program, State(program, 5))
         call.arguments["x"][:, 0] = np.arange(5.0)
         assert (call()["out"][:, 0] == np.arange(5.0) * (gain * 2 + 1) + 1.0).all()
+
+
+def test_tables_are_converted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Numbers that depend on no parameter, as those of a recorded road, cost nothing in a call with other values."""
+    graph = Graph()
+    graph.parameters.append(np.array([0.3]))
+    gain, road = graph.uniform((0, 0), 0.3), [graph.const(float(i), FLOAT) for i in range(50)]
+    doubled = graph.binary("mul", gain, graph.const(2.0, FLOAT))
+    reading = Reading(graph, [*road, doubled, graph.binary("add", road[3], road[4])])
+    computed: list[str] = []
+    first = graph.recomputed
+
+    def counted(node: Node, values: dict[int, Any]) -> Any:
+        computed.append(node.op)
+        return first(node, values)
+
+    monkeypatch.setattr(graph, "recomputed", counted)
+    for value in (0.3, 0.7):
+        assert reading.bits([np.array([value])]).view(float).tolist() == [*range(50), 2 * value, 7.0]
+    assert computed == ["mul", "mul"]

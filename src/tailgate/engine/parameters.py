@@ -59,35 +59,56 @@ class Parameters:
 
 
 class Reading:
-    """The numbers of fixed nodes as functions of the parameters."""
+    """The numbers of fixed nodes as functions of the parameters. What depends on none of them is computed once."""
 
     def __init__(self, graph: Graph, nodes: Sequence[Node]) -> None:
-        self.graph, self.size = graph, len(nodes)
+        self.graph = graph
         direct: dict[int, list[tuple[int, int]]] = {}
-        self._rest: list[tuple[int, Node]] = []
+        rest: list[tuple[int, Node]] = []
         for i, node in enumerate(nodes):
-            if node.op == "uniform" and type(node.attr) is tuple:
+            if _is_parameter(node):
                 direct.setdefault(node.attr[0], []).append((i, node.attr[1]))
             else:
-                self._rest.append((i, node))
+                rest.append((i, node))
         self._direct = {leaf: np.array(places).T for leaf, places in direct.items()}
-        self._order = ordered(node for _, node in self._rest)
+        order, changing = ordered(node for _, node in rest), set()
+        known: dict[int, Any] = {}
+        for node in order:
+            if node.op == "uniform" or any(a.id in changing for a in node.args):
+                changing.add(node.id)
+            else:
+                known[node.id] = graph.recomputed(node, known)
+        self._rest = [(i, node) for i, node in rest if node.id in changing]
+        self._order = [node for node in order if node.id in changing]
+        read = {a.id for node in self._order for a in node.args}
+        self._known = {number: value for number, value in known.items() if number in read}  # not all, which may be many
+        self._first = np.zeros(max(1, len(nodes)), np.uint64)
+        for i, node in rest:
+            if node.id in known:
+                _write(self._first, i, node, known)
 
     def bits(self, values: Sequence[Array] | None = None) -> Array:
         """Return each number as 64 bits, for given values of the parameters or for their own."""
         values = self.graph.parameters if values is None else values
-        out = np.zeros(max(1, self.size), np.uint64)
+        out, known = self._first.copy(), dict(self._known)
         for leaf, (where, places) in self._direct.items():
             out[where] = values[leaf].view(np.uint64)[places]
-        known: dict[int, Any] = {}
         for node in self._order:
-            if node.op == "uniform" and type(node.attr) is tuple:
+            if _is_parameter(node):
                 known[node.id] = values[node.attr[0]][node.attr[1]]
             else:
                 known[node.id] = self.graph.value(node) if node.op == "uniform" else self.graph.recomputed(node, known)
         for i, node in self._rest:
-            out[i : i + 1].view(node.dtype)[:1] = known[node.id]
+            _write(out, i, node, known)
         return out
+
+
+def _is_parameter(node: Node) -> bool:
+    return node.op == "uniform" and type(node.attr) is tuple
+
+
+def _write(bits: Array, place: int, node: Node, known: dict[int, Any]) -> None:
+    bits[place : place + 1].view(node.dtype)[:1] = known[node.id]
 
 
 class _Reader:
