@@ -236,7 +236,7 @@ def test_episodes_side_by_side_change_no_derivative(monkeypatch):
     loop = loop_of(*LOOPS["car"])
     injection, keys, schedule = Injection(loop, Trigger()), draws.keys("train", range(5)), drawn(loop, 6)
     together = [gradient_of(injection, keys, sent, None) for sent in (schedule.sent, for_each(schedule, 5).sent)]
-    monkeypatch.setattr("tailgate.ensemble.gradient.ROOM", 2.5 * 8 * injection.operations * loop.horizon)
+    monkeypatch.setattr("tailgate.ensemble.gradient.ROOM", 2.5 * 8 * injection.numbers * loop.horizon)
     apart = [gradient_of(injection, keys, sent, None) for sent in (schedule.sent, for_each(schedule, 5).sent)]
     for one, two in zip(together, apart, strict=True):
         assert np.array_equal(one[0], two[0]) and np.allclose(one[1], two[1], rtol=1e-12, atol=1e-15)

@@ -1,4 +1,4 @@
-"""The torch form of a trace: the same numbers, with derivatives. It is not the scored path.
+"""The torch form of a trace: the same numbers, with derivatives, for operations that `adjoint` has no rule for. It is not the scored path.
 
 Machine code computes the numbers that no differentiated argument reaches; the others are float64 tensors on the processor.
 Each operation gives the bits that numpy gives. Comparisons, roundings and conversions to whole numbers have derivative 0.
@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from tailgate.engine.adjoint import FLAT, moving
 from tailgate.engine.evaluation import Evaluation, multiplied
 from tailgate.engine.graph import Graph, Node, computed, ordered
-from tailgate.engine.operations import COMPARISONS, FLOAT, Array
+from tailgate.engine.operations import FLOAT, Array
 from tailgate.engine.program import Program
 from tailgate.engine.tracing import Trace
 
@@ -23,7 +24,6 @@ except ImportError as error:
     raise ImportError("derivatives of a loop need PyTorch: pip install 'tailgate[train]'") from error
 
 Rule = Callable[[torch.Tensor], tuple[torch.Tensor, ...]]
-_FLAT = {"floor", "ceil", "trunc", "rint", "not", "bits", *COMPARISONS}  # operations with derivative 0
 _DERIVATIVES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {"log": torch.reciprocal}  # of routines on the bits of a number
 
 
@@ -81,7 +81,7 @@ class TorchEvaluation(Evaluation):
             return self._parted(node.args[0], args[0])[node.attr]
         if not _differentiated(args):
             return super().compute(node, args)
-        if node.op in _FLAT or (node.op == "cast" and node.dtype != FLOAT):
+        if node.op in FLAT or (node.op == "cast" and node.dtype != FLOAT):
             return super().compute(node, [plain(a) for a in args])
         if node.op == "invert":
             return _inverted(node, args[0])
@@ -175,16 +175,6 @@ def _most(x: Any, y: Any) -> torch.Tensor:
     return _select((a > b) | (a != a), x, y)
 
 
-def _remainder(x: Any, y: Any) -> torch.Tensor:
-    left, right = tensor(x), tensor(y)
-    quotient = torch.floor(left.detach() / right.detach())
-    sizes = left.shape, right.shape
-    return ruled(
-        np.remainder(plain(left), plain(right)),
-        lambda grad: (grad.sum_to_size(sizes[0]), (-quotient * grad).sum_to_size(sizes[1])), left, right,
-    )  # fmt: skip
-
-
 def _inverted(node: Node, numbers: torch.Tensor) -> torch.Tensor:
     """Return the inverses of symmetric matrices; a change D of one changes its inverse S by -S D S."""
     q = node.attr
@@ -203,7 +193,7 @@ def _inverted(node: Node, numbers: torch.Tensor) -> torch.Tensor:
 
 _OPERATIONS: dict[str, Callable[..., Any]] = {
     "add": lambda x, y: torch.add(tensor(x), tensor(y)), "sub": lambda x, y: torch.sub(tensor(x), tensor(y)),
-    "mul": lambda x, y: torch.mul(tensor(x), tensor(y)), "div": _divide, "min": _least, "max": _most, "rem": _remainder,
+    "mul": lambda x, y: torch.mul(tensor(x), tensor(y)), "div": _divide, "min": _least, "max": _most,
     "neg": torch.neg, "abs": torch.abs, "sqrt": _root, "select": _select, "cast": lambda x: x,
 }  # fmt: skip
 
@@ -223,19 +213,19 @@ class TorchForm:
         asked = {name: nodes.item() for name, nodes in trace.results.items()}
         pairs = [pair for name in trace.state for pair in trace.pairs(name)]
         nodes = ordered([*asked.values(), *(new for _, new in pairs)])
-        moving = _moving(nodes, [node for held in trace.arguments.values() for node in held.flat], pairs)
+        reached = moving(nodes, [node for held in trace.arguments.values() for node in held.flat], pairs)
         self._arguments, self._large = trace.arguments, {now.attr for now, _ in trace.large.values()}
-        self._state = {now.attr: new for now, new in pairs if now.id in moving}
-        self._results = {name: node for name, node in asked.items() if node.id in moving}
-        self._evaluation = TorchEvaluation(trace.graph, [*self._results.values(), *self._state.values()], moving)
-        given = {a.id: a for node in nodes if node.id in moving for a in node.args if not a.fixed and a.id not in moving}
+        self._state = {now.attr: new for now, new in pairs if now.id in reached}
+        self._results = {name: node for name, node in asked.items() if node.id in reached}
+        self._evaluation = TorchEvaluation(trace.graph, [*self._results.values(), *self._state.values()], reached)
+        given = {a.id: a for node in nodes if node.id in reached for a in node.args if not a.fixed and a.id not in reached}
         self._given: dict[str, list[Node]] = {}  # what machine code hands over, by type
         for node in given.values():
             self._given.setdefault(f"given {node.dtype}", []).append(node)
-        self._program = _program(trace, {name: node for name, node in asked.items() if node.id not in moving}, self._given)
+        self._program = _program(trace, {name: node for name, node in asked.items() if node.id not in reached}, self._given)
 
     @property
-    def operations(self) -> int:
+    def numbers(self) -> int:
         """The numbers that derivatives keep of a step, about."""
         return self._evaluation.operations + sum(node.size or 1 for nodes in self._given.values() for node in nodes)
 
@@ -281,19 +271,3 @@ def _program(trace: Trace, results: dict[str, Node], given: dict[str, list[Node]
     for name, nodes in given.items():
         wanted[name] = np.array([[one for node in nodes for one in (trace.graph.picks(node) if node.size else [node])]], object)
     return Program(trace.pruned(wanted))
-
-
-def _moving(nodes: Sequence[Node], arguments: Sequence[Node], pairs: Sequence[tuple[Node, Node]]) -> set[int]:
-    """Return the numbers of the nodes that the arguments reach on a way with derivatives, in this step or in a later one.
-
-    pairs: the nodes of the state, now and next.
-    """
-    moving, before = {node.id for node in arguments}, -1
-    while len(moving) > before:
-        before = len(moving)
-        for node in nodes:
-            through = node.op in ("call", "loop") or (node.dtype == FLOAT and node.op not in _FLAT)
-            if through and any(a.id in moving for a in node.args):
-                moving.add(node.id)
-        moving |= {now.id for now, new in pairs if new.id in moving}
-    return moving

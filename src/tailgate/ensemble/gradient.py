@@ -84,7 +84,7 @@ def gradient_of(injection: Injection, keys: Keys, sent: Array, bound: float | No
 
     A derivative that is not finite counts as 0: its direction is unknown.
     """
-    each = max(int(ROOM // (8 * injection.operations * injection.loop.horizon)), 1)
+    each = max(int(ROOM // (8 * injection.numbers * injection.loop.horizon)), 1)
     parts = []
     for first in range(0, len(keys.key), each):
         some = slice(first, first + each)

@@ -1,6 +1,7 @@
-"""Episodes under injected values, differentiated: a closed loop in the torch form of the engine.
+"""Episodes under injected values, differentiated: a closed loop in machine code, forwards and backwards.
 
 A schedule has a value for each step after a trigger has opened, each agent and each wire. All episodes share it, or each has its own.
+Where the engine has no rule for an operation of the loop, the torch form plays it, which takes twenty times as long.
 """
 
 from __future__ import annotations
@@ -17,9 +18,14 @@ from tailgate.base.pytree import leaves
 from tailgate.core import Array, Kind
 from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import Loop
+from tailgate.engine import adjoint
+from tailgate.engine.adjoint import Adjoint
 from tailgate.engine.parameters import lifted
 from tailgate.engine.torch_form import TorchForm, tensor, torch
-from tailgate.engine.tracing import traced
+from tailgate.engine.tracing import Trace, traced
+from tailgate.engine.untraceable import Untraceable
+
+RESULTS = "gap", "error", "over", "on", "count"
 
 
 class Course(NamedTuple):
@@ -34,21 +40,27 @@ class Injection:
     """A loop in which an attacker adds the values of a schedule to the wires.
 
     The budget and the lengths of bursts are left to the schedule: a step whose values are zero is no attack.
+    compiled: False leaves all derivatives to PyTorch, which gives the same, slowly.
     """
 
-    def __init__(self, loop: Loop, trigger: Trigger) -> None:
+    def __init__(self, loop: Loop, trigger: Trigger, compiled: bool = True) -> None:
         threat = dataclasses.replace(loop.threat, budget=None, duration=None, cooldown=0)
         self.loop, self.trigger = dataclasses.replace(loop, threat=threat), trigger
         self._timing = trigger.prepare(self.loop.brief)
         one = self._begun(Keys(np.zeros((1, 3), np.uint64), np.zeros(1, np.uint32)))
         with np.errstate(all="ignore"):
             made = traced(self._step, one, {"value": np.zeros((1, *self.loop.brief.granted.shape))})
-        self._form = TorchForm(made, ("gap", "error", "over", "on", "count"))
+        self._form = (_compiled(made) if compiled else None) or TorchForm(made, RESULTS)
 
     @property
-    def operations(self) -> int:
-        """The operations of a step."""
-        return self._form.operations
+    def compiled(self) -> bool:
+        """If machine code computes the derivatives."""
+        return isinstance(self._form, Adjoint)
+
+    @property
+    def numbers(self) -> int:
+        """The numbers that derivatives keep of a step, about."""
+        return self._form.numbers
 
     def _begun(self, keys: Keys) -> dict[str, Any]:
         state, batch = self.loop.start(keys), len(keys.key)
@@ -79,17 +91,18 @@ class Injection:
         Course
             With derivatives for the schedule. It ends early when all episodes have.
         """
+        if isinstance(self._form, Adjoint):
+            gap, error, live = _Injected.apply(schedule, self, keys)  # type: ignore[no-untyped-call]
+            return Course(gap, error, live.numpy())
         begun, batch = self._begun(keys), len(keys.key)
         episodes, on, count = self._form.start(leaves(begun)), begun["on"], begun["count"]
-        rows, granted = torch.arange(batch), tensor(self.loop.brief.granted)
         columns: dict[str, list[Any]] = {"gap": [], "error": [], "live": []}
         with single_thread():
             for _ in range(self.loop.horizon):
-                place = torch.from_numpy(np.minimum(count, schedule.shape[-3] - 1))
-                sent = tensor(on & (count < schedule.shape[-3]))[:, None, None] & granted
+                sent, place = self.sent(on, count, schedule.shape[-3])
                 value: Any = np.zeros(sent.shape)
                 if sent.any():
-                    value = torch.where(sent, schedule[place] if schedule.ndim == 3 else schedule[rows, place], 0.0)
+                    value = torch.where(tensor(sent), schedule[place if schedule.ndim == 3 else (np.arange(batch), place)], 0.0)
                 made = episodes.step({"value": value})
                 on, count = made["on"], made["count"]
                 columns["live"].append(~made["over"])
@@ -98,6 +111,57 @@ class Injection:
                 if made["over"].all():
                     break
         return Course(torch.stack(columns["gap"]), torch.stack(columns["error"]), np.stack(columns["live"]))
+
+    def sent(self, on: Array, count: Array, length: int) -> tuple[Array, Array]:
+        """Return which values (B, N, w) of a schedule are sent, and the step (B,) of the schedule."""
+        return (on & (count < length))[:, None, None] & self.loop.brief.granted, np.minimum(count, length - 1)
+
+    def course(self, keys: Keys, schedule: Array) -> tuple[adjoint.Course, Array, Array]:
+        """Play episodes by machine code; return them with what is sent (K, B, N, w), and the steps of the schedule (K, B)."""
+        assert isinstance(self._form, Adjoint)
+        begun, rows = self._begun(keys), np.arange(len(keys.key))
+        course, on, count = self._form.start(leaves(begun), self.loop.horizon), begun["on"], begun["count"]
+        sends, places = [], []
+        for _ in range(self.loop.horizon):
+            sent, place = self.sent(on, count, schedule.shape[-3])
+            value = np.where(sent, schedule[place if schedule.ndim == 3 else (rows, place)], 0.0) if sent.any() else np.zeros(sent.shape)
+            made = course.step({"value": value})
+            on, count = made["on"], made["count"]
+            sends.append(sent)
+            places.append(place)
+            if made["over"].all():
+                break
+        return course, np.stack(sends), np.stack(places)
+
+
+def _compiled(trace: Trace) -> Adjoint | None:
+    """Return the derivatives of a trace by machine code, if there is a rule for each of its operations."""
+    try:
+        return Adjoint(trace, RESULTS, ("gap", "error"))
+    except Untraceable:
+        return None
+
+
+class _Injected(torch.autograd.Function):
+    """Gaps, errors and live steps (K, B) of episodes under a schedule, with its slopes."""
+
+    @staticmethod
+    def forward(ctx: Any, schedule: torch.Tensor, injection: Injection, keys: Keys) -> tuple[torch.Tensor, ...]:
+        ctx.shape, ctx.played = schedule.shape, injection.course(keys, schedule.detach().numpy())
+        course, sends, _ = ctx.played
+        gap, error, over = (course.results[name][: len(sends)] for name in ("gap", "error", "over"))
+        live = torch.from_numpy(~over)
+        ctx.mark_non_differentiable(live)
+        return torch.from_numpy(gap), torch.from_numpy(error), live
+
+    @staticmethod
+    def backward(ctx: Any, *slopes: torch.Tensor) -> tuple[torch.Tensor, None, None]:
+        course, sends, places = ctx.played
+        found = np.where(sends, course.backwards({"gap": slopes[0].numpy(), "error": slopes[1].numpy()})["value"], 0.0)
+        out, used = np.zeros(ctx.shape), sends.any(axis=(2, 3))
+        rows = np.broadcast_to(np.arange(course.episodes), used.shape)[used]
+        np.add.at(out, places[used] if out.ndim == 3 else (rows, places[used]), found[used])
+        return torch.from_numpy(out), None, None
 
 
 @contextlib.contextmanager

@@ -1,0 +1,105 @@
+"""Make a board whose searches take longer than one sitting. Finished searches stay in results/under-way, and the next sitting goes on.
+
+    python benchmarks/board_in_parts.py road-v0 [--hours 2] [--workers 2]
+
+Searches belong to the code that made them. The first sitting notes the commit, and each sitting plays in a work tree of that commit, below
+.under-way. A sitting ends after some hours, or when the board is there: .under-way/SUITE/boards/SUITE then goes to results by hand.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import tarfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+FILES = "policy:path=", "program:path="  # attacks that lie in files
+PAUSE = 20  # seconds between two looks for finished searches
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("suite", help="a built-in suite")
+    parser.add_argument("--hours", type=float, default=2.0, help="length of this sitting (default 2)")
+    parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
+    options = parser.parse_args()
+    kept, tree = ROOT / "results" / "under-way" / options.suite, ROOT / ".under-way" / options.suite
+    commit = commit_of(kept)
+    if not tree.is_dir():
+        git("worktree", "prune")
+        git("worktree", "add", "--quiet", "--detach", str(tree), commit)
+    elif git("-C", str(tree), "rev-parse", "HEAD") != commit:
+        print(f"{tree}: got another commit; expected {commit}. Remove it with `git worktree remove`.", file=sys.stderr)
+        return 2
+    for part in sorted(kept.glob("*.tar.xz")):
+        with tarfile.open(part) as held:
+            held.extractall(tree, filter="data")
+    command = [sys.executable, "-m", "tailgate", "leaderboard", "run", options.suite, "--out", "boards", "--train"]
+    environment = os.environ | {"PYTHONPATH": str(tree / "src")}
+    run = subprocess.Popen([*command, "--workers", str(options.workers)], cwd=tree, env=environment)
+    until = time.monotonic() + 3600 * options.hours
+    try:
+        while run.poll() is None and time.monotonic() < until:
+            time.sleep(PAUSE)
+            keep(tree, options.suite, kept)
+    finally:
+        if run.poll() is None:
+            run.send_signal(signal.SIGINT)
+        run.wait()
+        keep(tree, options.suite, kept)
+    print(f"{len(list(kept.glob('*.tar.xz')))} searches in {kept.relative_to(ROOT)}")
+    return 0
+
+
+def commit_of(kept: Path) -> str:
+    """Return the commit whose code makes the board: the noted one, or now the last one."""
+    note = kept / "commit"
+    if not note.is_file():
+        if git("status", "--porcelain", "--untracked-files=no"):
+            raise SystemExit("the working tree has changes: commit them, because searches belong to the code that made them")
+        kept.mkdir(parents=True, exist_ok=True)
+        note.write_text(git("rev-parse", "HEAD") + "\n")
+    return note.read_text().strip()
+
+
+def keep(tree: Path, suite: str, kept: Path) -> None:
+    """Pack each finished search with the files of its attacks."""
+    for result in sorted(tree.glob(f"boards/{suite}/attacked/searches/*/searches/*.json")):
+        packed = kept / f"{result.parents[1].name}-{result.stem}.tar.xz"
+        if packed.exists():
+            continue
+        partial = packed.with_suffix(".part")
+        with tarfile.open(partial, "w:xz") as out:
+            for path in (result.relative_to(tree), *files_of(json.loads(result.read_text()), tree)):
+                out.add(tree / path, str(path), filter=plain)
+        partial.replace(packed)
+
+
+def files_of(found: dict[str, list[dict[str, list[dict[str, str]]]]], tree: Path) -> Iterator[Path]:
+    """Yield the files of the attacks of a search, relative to the work tree."""
+    for attack in (one["attack"] for member in found["members"] for one in member["found"]):
+        if attack.startswith(FILES):
+            path = Path(attack.partition("=")[2])
+            yield from (part for part in (path, path.with_suffix(".safetensors")) if (tree / part).is_file())
+
+
+def plain(info: tarfile.TarInfo) -> tarfile.TarInfo:
+    """Leave out who made a file, and when."""
+    info.uid = info.gid = info.mtime = 0
+    info.uname = info.gname = ""
+    return info
+
+
+def git(*arguments: str) -> str:
+    return subprocess.run(["git", *arguments], cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

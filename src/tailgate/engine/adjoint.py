@@ -1,0 +1,223 @@
+"""Derivatives of a trace by machine code: steps forwards, then the same steps backwards with the slopes of a figure.
+
+The graph of a step is differentiated node by node (reverse accumulation, Griewank and Walther 2008). The way back computes each step again
+from the numbers that the way forth has kept of its state. Comparisons, roundings and conversions to whole numbers have derivative 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from tailgate.engine.graph import Graph, Node, ordered
+from tailgate.engine.operations import COMPARISONS, FLOAT, Array
+from tailgate.engine.program import Call, Program
+from tailgate.engine.tracing import Trace
+from tailgate.engine.untraceable import Untraceable
+
+FLAT = {"floor", "ceil", "trunc", "rint", "not", "bits", *COMPARISONS}  # operations with derivative 0
+Rule = Callable[[Graph, Node, Node], list[Node]]  # from a node and the slope of a figure by it, the slopes by its arguments
+
+
+def moving(nodes: Sequence[Node], arguments: Sequence[Node], pairs: Sequence[tuple[Node, Node]]) -> set[int]:
+    """Return the numbers of the nodes that the arguments reach on a way with derivatives, in this step or in a later one.
+
+    pairs: the nodes of the state, now and next.
+    """
+    found, before = {node.id for node in arguments}, -1
+    while len(found) > before:
+        before = len(found)
+        for node in nodes:
+            through = node.op in ("call", "loop") or (node.dtype == FLOAT and node.op not in FLAT)
+            if through and any(a.id in found for a in node.args):
+                found.add(node.id)
+        found |= {now.id for now, new in pairs if new.id in found}
+    return found
+
+
+def backwards(graph: Graph, reached: set[int], seeds: Sequence[tuple[Node, Node]], wanted: Sequence[Node]) -> list[Node]:
+    """Return the slopes of a figure by the wanted nodes, from its slopes by others.
+
+    Parameters
+    ----------
+    reached
+        Numbers of the nodes to differentiate, see `moving`.
+    seeds
+        Nodes, each with the slope of the figure by it.
+
+    Raises
+    ------
+    Untraceable
+        For an operation without a rule.
+    """
+    slopes: dict[int, Node] = {}
+
+    def gather(node: Node, slope: Node) -> None:
+        if node.id in reached:
+            held = slopes.get(node.id)
+            slopes[node.id] = slope if held is None else graph.binary("add", held, slope)
+
+    for node, slope in seeds:
+        gather(node, slope)
+    for node in reversed(ordered(node for node, _ in seeds)):
+        if node.id not in slopes or not node.args:
+            continue
+        if node.op not in _RULES:
+            raise Untraceable(f"a derivative of {node.op}", "use operations on numbers, or PyTorch")
+        for argument, slope in zip(node.args, _RULES[node.op](graph, node, slopes[node.id]), strict=True):
+            gather(argument, slope)
+    nothing = graph.const(0.0, FLOAT)
+    return [slopes.get(node.id, nothing) for node in wanted]
+
+
+def _choice(graph: Graph, first: Node, slope: Node) -> list[Node]:
+    """Return the slopes by two arguments of which one is chosen."""
+    nothing = graph.const(0.0, FLOAT)
+    return [graph.select(first, slope, nothing), graph.select(first, nothing, slope)]
+
+
+def _select(graph: Graph, node: Node, slope: Node) -> list[Node]:
+    return [slope, *_choice(graph, node.args[0], slope)]  # the first is of a mask, and counts for nothing
+
+
+def _extreme(graph: Graph, node: Node, slope: Node) -> list[Node]:
+    x, y = node.args
+    first = graph.binary("or", graph.binary("lt" if node.op == "min" else "gt", x, y), graph.binary("ne", x, x))
+    return _choice(graph, first, slope)
+
+
+def _product(graph: Graph, node: Node, slope: Node) -> list[Node]:
+    x, y = node.args
+    return [graph.binary("mul", slope, y), graph.binary("mul", slope, x)]
+
+
+def _quotient(graph: Graph, node: Node, slope: Node) -> list[Node]:
+    """Where the divisor is 0 the slopes are 0, because such a quotient is never selected."""
+    y, nothing = node.args[1], graph.const(0.0, FLOAT)
+    zero = graph.binary("eq", y, nothing)
+    by_x = graph.binary("div", slope, y)
+    by_y = graph.unary("neg", graph.binary("mul", slope, graph.binary("div", node, y)))
+    return [graph.select(zero, nothing, by_x), graph.select(zero, nothing, by_y)]
+
+
+def _root(graph: Graph, node: Node, slope: Node) -> list[Node]:
+    nothing = graph.const(0.0, FLOAT)
+    half = graph.binary("div", graph.const(0.5, FLOAT), node)
+    return [graph.binary("mul", slope, graph.select(graph.binary("eq", node, nothing), nothing, half))]
+
+
+def _size(graph: Graph, node: Node, slope: Node) -> list[Node]:
+    (x,), nothing = node.args, graph.const(0.0, FLOAT)
+    falls = graph.select(graph.binary("lt", x, nothing), graph.unary("neg", slope), nothing)
+    return [graph.select(graph.binary("gt", x, nothing), slope, falls)]
+
+
+_RULES: dict[str, Rule] = {
+    "add": lambda graph, node, slope: [slope, slope], "sub": lambda graph, node, slope: [slope, graph.unary("neg", slope)],
+    "neg": lambda graph, node, slope: [graph.unary("neg", slope)], "mul": _product, "div": _quotient, "min": _extreme, "max": _extreme,
+    "abs": _size, "sqrt": _root, "select": _select,
+}  # fmt: skip
+
+
+class Adjoint:
+    """The machine code of a trace forwards, and of its derivatives backwards."""
+
+    def __init__(self, trace: Trace, results: Sequence[str], figures: Sequence[str]) -> None:
+        """Compile both ways.
+
+        Parameters
+        ----------
+        trace
+            Of a function that maps a state and arguments to the next state and results.
+        results
+            Names of the results that are kept, one number of an episode each.
+        figures
+            Those of them that have slopes.
+
+        Raises
+        ------
+        Untraceable
+            For an operation without a rule, and for a state whose numbers lie in a buffer.
+        """
+        trace, graph = trace.pruned({name: trace.results[name] for name in results}), trace.graph
+        asked = {name: nodes.item() for name, nodes in trace.results.items()}
+        pairs = [pair for name in trace.state for pair in trace.pairs(name)]
+        given = [node for nodes in trace.arguments.values() for node in nodes.flat]
+        nodes = ordered([*asked.values(), *(new for _, new in pairs)])
+        reached = moving(nodes, given, pairs)
+        before = [(now, new, graph.input(("slope", now.id), FLOAT)) for now, new in pairs if now.id in reached]
+        seeds = {name: graph.input(("slope", name), FLOAT) for name in figures if asked[name].id in reached}
+        begun = [*((asked[name], slope) for name, slope in seeds.items()), *((new, slope) for _, new, slope in before)]
+        made = backwards(graph, reached, begun, [*(now for now, *_ in before), *given])
+        own = {node.id for node in [*given, *seeds.values(), *(slope for *_, slope in before)]}
+        needed = ordered(made)
+        if any(node.op == "held" for node in needed):
+            raise Untraceable("a derivative of numbers in a buffer", "keep fewer numbers in the state")
+        kept = [node for node in needed if node.op == "input" and node.id not in own]
+        self._kept = [f"kept {number}" for number in range(len(kept))]
+        self._figures, self._size = list(seeds), len(before)
+        saved = {name: _single(node) for name, node in zip(self._kept, kept, strict=True)}
+        self._forwards = Program(trace.pruned(trace.results | saved))
+        parts, out = iter(made[len(before) :]), {}
+        for name, held in trace.arguments.items():
+            out[name] = np.array([next(parts) for _ in held.flat], object).reshape(held.shape)
+        state = {"slope": (np.array([[slope for *_, slope in before]], object), np.array([made[: len(before)]], object))} if before else {}
+        taken = trace.arguments | saved | {f"slope {name}": _single(slope) for name, slope in seeds.items()}
+        self._backwards = Program(Trace(graph, state, taken, out, None))
+
+    @property
+    def numbers(self) -> int:
+        """The numbers that the way forth keeps of a step, and the way back takes."""
+        return 2 * (len(self._kept) + len(self._figures))
+
+    def start(self, held: Mapping[str, Array], steps: int) -> Course:
+        """Return episodes that begin with these leaves (B, ...), by dotted name, for some steps."""
+        return Course(self, held, max(2, steps))
+
+
+class Course:
+    """Episodes that are played forwards step by step, and then backwards at once."""
+
+    def __init__(self, form: Adjoint, held: Mapping[str, Array], steps: int) -> None:
+        self._form, self._steps, self._done = form, steps, 0
+        self.episodes = len(next(iter(held.values())))
+        state = form._forwards.rows(self.episodes)
+        for name in form._forwards.places:
+            state.put_leaf(name, held[name])
+        self._call = Call(form._forwards, state, steps)
+        self._call.begin()
+        self.results = self._call.results()  # (steps, B); those of steps to come are not yet written
+
+    def step(self, arguments: Mapping[str, Array]) -> dict[str, Array]:
+        """Play a step under arguments (B, ...); return its results (B,)."""
+        for name, value in arguments.items():
+            self._call.arguments[name][self._done] = value
+        self._call.play(1)
+        self._done += 1
+        return {name: column[self._done - 1] for name, column in self.results.items() if name not in self._form._kept}
+
+    def backwards(self, slopes: Mapping[str, Array]) -> dict[str, Array]:
+        """Return the slopes of a figure by the arguments of all steps (K, B, ...), from its slopes (K, B) by results."""
+        form, back = self._form, slice(self._done - 1, None, -1)
+        state = form._backwards.rows(self.episodes)
+        if form._size:
+            state.put_leaf("slope", np.zeros((self.episodes, form._size)))
+        call = Call(form._backwards, state, self._steps)
+        for name, place in call.arguments.items():
+            place[: self._done] = self._column(name, slopes)[back]
+        call.begin()
+        call.play(self._done)
+        return {name: column[back] for name, column in call.results().items()}
+
+    def _column(self, name: str, slopes: Mapping[str, Array]) -> Array:
+        """Return an argument of the way back, of all steps that were played."""
+        if name in self._form._kept:
+            return self.results[name][: self._done]
+        if name in self._call.arguments:
+            return self._call.arguments[name][: self._done]
+        return slopes[name.removeprefix("slope ")]
+
+
+def _single(node: Node) -> Array:
+    return np.array([node], object)
