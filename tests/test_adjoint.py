@@ -57,7 +57,8 @@ def test_each_operation_has_the_slope_of_pytorch(name):
 @pytest.mark.thin(2)
 @pytest.mark.parametrize(("scenario", "defence", "horizon"), [
     ("gusty-stop-and-go-v0", "chi2_kf", 60), ("stop-and-go-v0", "safe_state_brake", 60), ("stop-and-go-v0", "imm", 40),
-    ("road-following-v0", "rkf", 50), ("lane-keeping-v0", "cusum_reacquire_kf", 40),
+    ("road-following-v0", "rkf", 50), ("lane-keeping-v0", "cusum_reacquire_kf", 40), ("road-string-v0", "kf", 60),
+    ("platoon-gusty-v0", "dkf", 40), ("network-restless-weak-v0", "dkf", 20),
 ])  # fmt: skip
 def test_whole_loops_have_the_slopes_of_pytorch(scenario, defence, horizon):
     place, spec = load_scenario(scenario).with_threat(kinds=("fdi",), onset=2, end=None, budget=None), Spec("defence", defence)
@@ -74,5 +75,5 @@ def test_whole_loops_have_the_slopes_of_pytorch(scenario, defence, horizon):
 
 
 def test_what_has_no_rule_is_left_to_pytorch():
-    place, spec = load_scenario("platoon-gusty-v0").with_threat(kinds=("fdi",)), Spec("defence", "dkf")
+    place, spec = load_scenario("platoon-gusty-v0").with_threat(kinds=("fdi",)), Spec("defence", "trust_dkf")
     assert not Injection(place.loop(spec.make(), spec.entry.uses), Trigger()).compiled

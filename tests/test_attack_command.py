@@ -30,6 +30,12 @@ WORDS = [
 ]
 
 
+def only(monkeypatch, *names):
+    """Let these members search and be reported, and no others."""
+    for module in (members, standard):
+        monkeypatch.setattr(module, "MEMBERS", [one for one in members.MEMBERS if one.name in names])
+
+
 def test_the_command(small_ensemble, tmp_path, capsys, monkeypatch):
     """It compares with the suite's attacks, writes scripts that `evaluate` plays, and goes on where it was ended."""
     assert main([*WORDS, "--out", str(tmp_path), "--json"]) == 0
@@ -105,7 +111,7 @@ def test_a_class_of_ones_own_is_attacked(small_ensemble, tmp_path, monkeypatch, 
     (tmp_path / "attacked_defence.py").write_text("from tailgate.estimators import GatedKalman\n\n\nclass Mine(GatedKalman):\n    pass\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(members, "MEMBERS", [one for one in members.MEMBERS if one.name in ("scripts", "networks")])
+    only(monkeypatch, "scripts", "networks")
     assert main([WORDS[0], "attacked_defence:Mine", *WORDS[2:], "--out", "found", "--json"]) == 0
     (cell,) = json.loads(capsys.readouterr().out)["cells"]
     scripts, networks = cell["members"]
@@ -118,7 +124,7 @@ def test_a_scenario_of_ones_own(small_ensemble, tmp_path, monkeypatch):
     """Its rows carry its name; another content under the same path is searched again; files lie in the folder that was named."""
     source = (Path(__file__).parents[1] / "configs" / "scenarios" / "radar-braking-v0.yaml").read_text()
     (tmp_path / "mine.yaml").write_text(source)
-    monkeypatch.setattr(members, "MEMBERS", [one for one in members.MEMBERS if one.name in ("scripts", "networks")])
+    only(monkeypatch, "scripts", "networks")
     suite = dataclasses.replace(load_suite("radar-v0"), name="custom", scenarios=(str(tmp_path / "mine.yaml"),), doses=(4,), robustness=())
     report = standard.attack(suite, "chi2_kf", budget="quick", episodes=8, out=tmp_path / "out")
     (cell,) = report["cells"]
@@ -133,7 +139,7 @@ def test_a_scenario_of_ones_own(small_ensemble, tmp_path, monkeypatch):
 def test_budgets_share_no_file(small_ensemble, tmp_path, monkeypatch):
     """Two budgets in one folder keep their own policies."""
     monkeypatch.setitem(members.BUDGETS, "standard", members.BUDGETS["quick"])
-    monkeypatch.setattr(members, "MEMBERS", [one for one in members.MEMBERS if one.name == "networks"])
+    only(monkeypatch, "networks")
     suite = load_suite("radar-v0")
     texts = {
         budget: standard.attack(
@@ -156,7 +162,7 @@ def test_a_defence_that_is_not_traced(small_ensemble, tmp_path, monkeypatch, cap
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr(searching, "FIRST", 2)
     monkeypatch.setattr(searching, "MORE", 2)
-    monkeypatch.setattr(members, "MEMBERS", [one for one in members.MEMBERS if one.name in ("scripts", "networks", "gradient")])
+    only(monkeypatch, "scripts", "networks", "gradient")
     words = [
         "attack",
         "branching_defence:Mine",

@@ -1,7 +1,8 @@
 """Derivatives of a trace by machine code: steps forwards, then the same steps backwards with the slopes of a figure.
 
-The graph of a step is differentiated node by node (reverse accumulation, Griewank and Walther 2008). The way back computes each step again
-from the numbers that the way forth has kept of its state. Comparisons, roundings and conversions to whole numbers have derivative 0.
+The graph of a step is differentiated node by node (reverse accumulation, Griewank and Walther 2008). The way forth keeps what the way back
+needs. These are the numbers of the state that an argument reaches, and those that none reaches, such as gates and gains.
+Comparisons, roundings and conversions to whole numbers have derivative 0.
 """
 
 from __future__ import annotations
@@ -10,12 +11,14 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from tailgate.engine.graph import Graph, Node, ordered
+from tailgate.engine.buffers import is_pick
+from tailgate.engine.graph import Graph, Node, Piece, Source, Sweep, ordered
 from tailgate.engine.operations import COMPARISONS, FLOAT, Array
 from tailgate.engine.program import Call, Program
 from tailgate.engine.tracing import Trace
 from tailgate.engine.untraceable import Untraceable
 
+LONGEST, WIDEST = 20_000, 1000  # operations of a step, and numbers kept of it: with more PyTorch is as fast
 FLAT = {"floor", "ceil", "trunc", "rint", "not", "bits", *COMPARISONS}  # operations with derivative 0
 Rule = Callable[[Graph, Node, Node], list[Node]]  # from a node and the slope of a figure by it, the slopes by its arguments
 
@@ -36,6 +39,92 @@ def moving(nodes: Sequence[Node], arguments: Sequence[Node], pairs: Sequence[tup
     return found
 
 
+class Straight:
+    """The numbers that an argument reaches, computed one by one from given numbers: sweeps are unrolled, and only matrices are kept."""
+
+    def __init__(self, graph: Graph, reached: set[int], roots: Sequence[Node]) -> None:
+        """Raise Untraceable for operations that have no straight form."""
+        self.graph, self._made, self._buffers = graph, dict[int, Node](), dict[int, list[Node]]()
+        self.given: dict[Node, Node] = {}  # numbers of the trace, and the inputs that have them
+        before = graph.operations
+        for node in ordered(roots):
+            if node.id not in reached:
+                continue
+            if node.op == "input":
+                self._made[node.id] = self.given[node] = node
+            elif node.size:
+                self._buffers[node.id] = self._buffer(node)
+            else:
+                self._made[node.id] = self._rebuilt(node, [self.number(a) for a in node.args if not a.size])
+            if graph.operations - before > LONGEST:
+                raise Untraceable(f"a derivative of more than {LONGEST:,} operations", "use PyTorch")
+
+    def number(self, node: Node) -> Node:
+        """Return what has the number of a node of the trace."""
+        if node.fixed:
+            return node
+        if node.id in self._made:
+            return self._made[node.id]
+        if is_pick(node) and node.args[0].id in self._buffers:
+            return self._buffers[node.args[0].id][int(node.attr)]
+        if node not in self.given:
+            self.given[node] = self.graph.input(("given", node.id), node.dtype)
+        return self.given[node]
+
+    def _rebuilt(self, node: Node, args: list[Node]) -> Node:
+        """Return the operation of a node on other arguments."""
+        if is_pick(node):
+            return self.number(node)
+        if node.op not in _RULES:
+            raise Untraceable(f"a derivative of {node.op}", "use operations on numbers, or PyTorch")
+        return _again(self.graph, node, args)
+
+    def _buffer(self, node: Node) -> list[Node]:
+        """Return the numbers of a buffer."""
+        if node.op == "matvec":
+            matrix, there, _ = node.attr
+            numbers = [self.number(a) for a in node.args]
+            return self.graph.matvec(matrix, numbers[: matrix.shape[1]], numbers[matrix.shape[1] :], there)
+        if node.op == "pack":
+            return [one for piece in node.attr for one in self._piece(piece)]
+        if node.op == "sweep":
+            return [one for place in np.ndindex(*node.attr.shape) for one in self._round(node.attr, place)]
+        raise Untraceable(f"a derivative of {node.op}", "use operations on numbers, or PyTorch")
+
+    def _piece(self, piece: Piece) -> list[Node]:
+        if isinstance(piece.source, Node):
+            return [self.number(piece.source)]
+        return [self._element(piece.source, place) for place in np.ndindex(*piece.shape)]
+
+    def _element(self, source: Source, place: Sequence[int]) -> Node:
+        at = source.offset + sum(i * n for i, n in zip(place, source.strides, strict=True))
+        return self.number(source.held[at] if isinstance(source.held, tuple) else self.graph.picks(source.held)[at])
+
+    def _round(self, body: Sweep, place: tuple[int, ...]) -> list[Node]:
+        """Return the results of one round of a sweep."""
+        mine = {one.id: self._element(source, place) for one, source in zip(body.carried, body.sources, strict=True)}
+
+        def found(node: Node) -> Node:
+            return mine[node.id] if node.id in mine else self.number(node)
+
+        for node in body.nodes:
+            if node.size or is_pick(node) or node.op in ("loop", "call", "gather"):
+                raise Untraceable(f"a derivative of {node.op} in a sweep", "use operations on numbers, or PyTorch")
+            mine[node.id] = _again(self.graph, node, [found(a) for a in node.args])
+        return [found(node) for node in body.after]
+
+
+def _again(graph: Graph, node: Node, args: list[Node]) -> Node:
+    """Return an operation on other arguments."""
+    if node.op == "select":
+        return graph.select(args[0], args[1], args[2])
+    if node.op == "cast":
+        return graph.cast(args[0], node.dtype)
+    if node.op == "bits":
+        return graph.bits(args[0], node.dtype)
+    return graph.unary(node.op, args[0]) if len(args) == 1 else graph.binary(node.op, args[0], args[1])
+
+
 def backwards(graph: Graph, reached: set[int], seeds: Sequence[tuple[Node, Node]], wanted: Sequence[Node]) -> list[Node]:
     """Return the slopes of a figure by the wanted nodes, from its slopes by others.
 
@@ -45,29 +134,30 @@ def backwards(graph: Graph, reached: set[int], seeds: Sequence[tuple[Node, Node]
         Numbers of the nodes to differentiate, see `moving`.
     seeds
         Nodes, each with the slope of the figure by it.
-
-    Raises
-    ------
-    Untraceable
-        For an operation without a rule.
     """
     slopes: dict[int, Node] = {}
+    parts: dict[int, dict[int, Node]] = {}  # of buffers, by place
+    nothing = graph.const(0.0, FLOAT)
 
     def gather(node: Node, slope: Node) -> None:
-        if node.id in reached:
+        if node.id in reached and slope is not nothing:
             held = slopes.get(node.id)
             slopes[node.id] = slope if held is None else graph.binary("add", held, slope)
 
     for node, slope in seeds:
         gather(node, slope)
     for node in reversed(ordered(node for node, _ in seeds)):
-        if node.id not in slopes or not node.args:
-            continue
-        if node.op not in _RULES:
-            raise Untraceable(f"a derivative of {node.op}", "use operations on numbers, or PyTorch")
-        for argument, slope in zip(node.args, _RULES[node.op](graph, node, slopes[node.id]), strict=True):
-            gather(argument, slope)
-    nothing = graph.const(0.0, FLOAT)
+        if node.op == "pick" and node.id in slopes:
+            parts.setdefault(node.args[0].id, {})[node.attr] = slopes[node.id]
+        elif node.op == "matvec" and node.id in parts:
+            matrix, there, _ = node.attr
+            of_rows = [parts[node.id].get(i, nothing) for i in range(len(matrix))]
+            of_columns = graph.matvec(matrix.T, of_rows, [nothing] * matrix.shape[1], None if there is None else there.T)
+            for argument, slope in zip(node.args, (*of_columns, *of_rows), strict=True):
+                gather(argument, slope)
+        elif node.args and node.id in slopes:
+            for argument, slope in zip(node.args, _RULES[node.op](graph, node, slopes[node.id]), strict=True):
+                gather(argument, slope)
     return [slopes.get(node.id, nothing) for node in wanted]
 
 
@@ -138,33 +228,35 @@ class Adjoint:
         Raises
         ------
         Untraceable
-            For an operation without a rule, and for a state whose numbers lie in a buffer.
+            For an operation without a rule, and for moving numbers of a state that lie in a buffer.
         """
         trace, graph = trace.pruned({name: trace.results[name] for name in results}), trace.graph
         asked = {name: nodes.item() for name, nodes in trace.results.items()}
         pairs = [pair for name in trace.state for pair in trace.pairs(name)]
         given = [node for nodes in trace.arguments.values() for node in nodes.flat]
-        nodes = ordered([*asked.values(), *(new for _, new in pairs)])
-        reached = moving(nodes, given, pairs)
-        before = [(now, new, graph.input(("slope", now.id), FLOAT)) for now, new in pairs if now.id in reached]
+        reached = moving(ordered([*asked.values(), *(new for _, new in pairs)]), given, pairs)
+        state = [(now, new) for now, new in pairs if now.id in reached]
+        ends = [asked[name] for name in figures if asked[name].id in reached] + [new for _, new in state if new.id in reached]
+        straight = Straight(graph, reached, ends)
+        before = [(now, straight.number(new), graph.input(("slope", now.id), FLOAT)) for now, new in state]
         seeds = {name: graph.input(("slope", name), FLOAT) for name in figures if asked[name].id in reached}
-        begun = [*((asked[name], slope) for name, slope in seeds.items()), *((new, slope) for _, new, slope in before)]
-        made = backwards(graph, reached, begun, [*(now for now, *_ in before), *given])
-        own = {node.id for node in [*given, *seeds.values(), *(slope for *_, slope in before)]}
-        needed = ordered(made)
-        if any(node.op == "held" for node in needed):
-            raise Untraceable("a derivative of numbers in a buffer", "keep fewer numbers in the state")
-        kept = [node for node in needed if node.op == "input" and node.id not in own]
+        begun = [*((straight.number(asked[name]), slope) for name, slope in seeds.items()), *((new, slope) for _, new, slope in before)]
+        wanted = [*(now for now, *_ in before), *given]
+        made = backwards(graph, moving(ordered(node for node, _ in begun), wanted, []), begun, wanted)
+        needed, own = {node.id for node in ordered(made)}, {node.id for node in given}
+        kept = [(node, place) for node, place in straight.given.items() if place.id in needed and place.id not in own]
+        if len(kept) > WIDEST:
+            raise Untraceable(f"a derivative that needs {len(kept):,} numbers of a step", "use PyTorch")
         self._kept = [f"kept {number}" for number in range(len(kept))]
         self._figures, self._size = list(seeds), len(before)
-        saved = {name: _single(node) for name, node in zip(self._kept, kept, strict=True)}
+        saved, taken = ({name: _single(pair[i]) for name, pair in zip(self._kept, kept, strict=True)} for i in (0, 1))
         self._forwards = Program(trace.pruned(trace.results | saved))
         parts, out = iter(made[len(before) :]), {}
         for name, held in trace.arguments.items():
             out[name] = np.array([next(parts) for _ in held.flat], object).reshape(held.shape)
-        state = {"slope": (np.array([[slope for *_, slope in before]], object), np.array([made[: len(before)]], object))} if before else {}
-        taken = trace.arguments | saved | {f"slope {name}": _single(slope) for name, slope in seeds.items()}
-        self._backwards = Program(Trace(graph, state, taken, out, None))
+        slopes = {"slope": (np.array([[slope for *_, slope in before]], object), np.array([made[: len(before)]], object))} if before else {}
+        taken |= trace.arguments | {f"slope {name}": _single(slope) for name, slope in seeds.items()}
+        self._backwards = Program(Trace(graph, slopes, taken, out, None))
 
     @property
     def numbers(self) -> int:

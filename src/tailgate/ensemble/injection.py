@@ -1,7 +1,7 @@
 """Episodes under injected values, differentiated: a closed loop in machine code, forwards and backwards.
 
 A schedule has a value for each step after a trigger has opened, each agent and each wire. All episodes share it, or each has its own.
-Where the engine has no rule for an operation of the loop, the torch form plays it, which takes twenty times as long.
+Where the engine has no rule for an operation of the loop, the torch form plays it, which takes ten times as long or more.
 """
 
 from __future__ import annotations
