@@ -153,13 +153,13 @@ class Member(NamedTuple):
 
 
 MEMBERS = (
-    Member("scripts", "black", _scripts, 4),
-    Member("programs", "black", _programs, 4),
-    Member("transfer", "black", _transfer, 2),
-    Member("networks", "black", lambda hunt: _policies(hunt, "black"), 40, learns=True),
-    Member("grey networks", "grey", lambda hunt: _policies(hunt, "grey"), 20, learns=True),
-    Member("white box", "white", _white_box, 2),
-    Member("gradient", "white", _gradient, 28, learns=True),
+    Member("scripts", "black", _scripts, 7),
+    Member("programs", "black", _programs, 7),
+    Member("transfer", "black", _transfer, 1),
+    Member("networks", "black", lambda hunt: _policies(hunt, "black"), 48, learns=True),
+    Member("grey networks", "grey", lambda hunt: _policies(hunt, "grey"), 30, learns=True),
+    Member("white box", "white", _white_box, 3),
+    Member("gradient", "white", _gradient, 4, learns=True),
 )
 
 
