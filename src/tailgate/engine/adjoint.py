@@ -75,8 +75,7 @@ class Straight:
         """Return the operation of a node on other arguments."""
         if is_pick(node):
             return self.number(node)
-        if node.op not in _RULES:
-            raise Untraceable(f"a derivative of {node.op}", "use operations on numbers, or PyTorch")
+        _check(node)
         return _again(self.graph, node, args)
 
     def _buffer(self, node: Node) -> list[Node]:
@@ -125,6 +124,11 @@ def _again(graph: Graph, node: Node, args: list[Node]) -> Node:
     return graph.unary(node.op, args[0]) if len(args) == 1 else graph.binary(node.op, args[0], args[1])
 
 
+def _check(node: Node) -> None:
+    if node.op not in _RULES:
+        raise Untraceable(f"a derivative of {node.op}", "use operations on numbers, or PyTorch")
+
+
 def backwards(graph: Graph, reached: set[int], seeds: Sequence[tuple[Node, Node]], wanted: Sequence[Node]) -> list[Node]:
     """Return the slopes of a figure by the wanted nodes, from its slopes by others.
 
@@ -134,6 +138,11 @@ def backwards(graph: Graph, reached: set[int], seeds: Sequence[tuple[Node, Node]
         Numbers of the nodes to differentiate, see `moving`.
     seeds
         Nodes, each with the slope of the figure by it.
+
+    Raises
+    ------
+    Untraceable
+        For an operation without a rule.
     """
     slopes: dict[int, Node] = {}
     parts: dict[int, dict[int, Node]] = {}  # of buffers, by place
@@ -156,6 +165,7 @@ def backwards(graph: Graph, reached: set[int], seeds: Sequence[tuple[Node, Node]
             for argument, slope in zip(node.args, (*of_columns, *of_rows), strict=True):
                 gather(argument, slope)
         elif node.args and node.id in slopes:
+            _check(node)
             for argument, slope in zip(node.args, _RULES[node.op](graph, node, slopes[node.id]), strict=True):
                 gather(argument, slope)
     return [slopes.get(node.id, nothing) for node in wanted]
