@@ -21,7 +21,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 FILES = "policy:path=", "program:path="  # attacks that lie in files
-PAUSE = 20  # seconds between two looks for finished searches
+PAUSE, PATIENCE = 20, 300  # seconds between two looks for finished searches, and for the end of a sitting
 
 
 def main() -> int:
@@ -41,6 +41,7 @@ def main() -> int:
     for part in sorted(kept.glob("*.tar.xz")):
         with tarfile.open(part) as held:
             held.extractall(tree, filter="data")
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it, and would pass that on
     command = [sys.executable, "-m", "tailgate", "leaderboard", "run", options.suite, "--out", "boards", "--train"]
     environment = os.environ | {"PYTHONPATH": str(tree / "src")}
     run = subprocess.Popen([*command, "--workers", str(options.workers)], cwd=tree, env=environment)
@@ -52,7 +53,10 @@ def main() -> int:
     finally:
         if run.poll() is None:
             run.send_signal(signal.SIGINT)
-        run.wait()
+        try:
+            run.wait(PATIENCE)
+        except subprocess.TimeoutExpired:
+            run.kill()
         keep(tree, options.suite, kept)
     print(f"{len(list(kept.glob('*.tar.xz')))} searches in {kept.relative_to(ROOT)}")
     return 0
