@@ -4,15 +4,17 @@ import numpy as np
 import pytest
 
 from tailgate.agents.scripts.triggers import Trigger
+from tailgate.base.errors import NotApplicable
 from tailgate.core import draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
 from tailgate.engine.adjoint import Adjoint
 from tailgate.engine.tracing import traced
+from tailgate.ensemble.search import Arena
 
 torch = pytest.importorskip("torch")
 from tailgate.engine.torch_form import TorchForm  # noqa: E402
-from tailgate.ensemble.gradient import gradient_of  # noqa: E402
+from tailgate.ensemble.gradient import Pace, gradient, gradient_of  # noqa: E402
 from tailgate.ensemble.injection import Injection  # noqa: E402
 
 OPERATIONS = {
@@ -43,14 +45,14 @@ def test_each_operation_has_the_slope_of_pytorch(name):
         return {"x": 0.5 * made, "kept": state["kept"]}, {"y": made, "sign": made > 0.0}
 
     trace = traced(step, {key: leaf[:1] for key, leaf in held.items()}, {"u": arguments[0, :1]})
-    course = Adjoint(trace, ("y", "sign"), ("y",)).start(held, STEPS + 3)  # it may end early
+    tape = Adjoint(trace, ("y", "sign"), ("y",)).start(held, STEPS + 3)  # it may end early
     plain = dict(held)
     for given in arguments:
         with np.errstate(all="ignore"):
             plain, wanted = step(plain, {"u": given})
-        made = course.step({"u": given})
+        made = tape.step({"u": given})
         assert all(np.array_equal(made[key], wanted[key]) for key in wanted) and set(made) == set(wanted)
-    found, wanted = course.backwards({"y": slopes})["u"], by_torch(TorchForm(trace, ("y",)), held, arguments, slopes)
+    found, wanted = tape.backwards({"y": slopes})["u"], by_torch(TorchForm(trace, ("y",)), held, arguments, slopes)
     assert np.allclose(found, wanted, rtol=1e-12, atol=1e-14) and wanted.any()
 
 
@@ -77,3 +79,10 @@ def test_whole_loops_have_the_slopes_of_pytorch(scenario, defence, horizon):
 def test_what_has_no_rule_is_left_to_pytorch():
     place, spec = load_scenario("platoon-gusty-v0").with_threat(kinds=("fdi",)), Spec("defence", "trust_dkf")
     assert not Injection(place.loop(spec.make(), spec.entry.uses), Trigger()).compiled
+
+
+def test_several_agents_without_machine_code_are_refused(tmp_path):
+    arena = Arena("test", "platoon-gusty-v0", 20, "trust_dkf", {"kinds": ("fdi",), "fdi_bound": 3.0}, None)
+    with pytest.raises(NotApplicable, match=r"agents.*5.*PyTorch takes half a minute"):
+        gradient(arena, Pace(8, 1, 1, 2), tmp_path, scripts=["fdi:value=3"])
+    assert not list(tmp_path.iterdir())

@@ -18,7 +18,7 @@ from tailgate.engine.program import Call, Program
 from tailgate.engine.tracing import Trace
 from tailgate.engine.untraceable import Untraceable
 
-LONGEST, WIDEST = 20_000, 1000  # operations of a step, and numbers kept of it: with more PyTorch is as fast
+LONGEST, WIDEST = 20_000, 1000  # most operations of a step, and numbers kept of it: with 4163 of these PyTorch was faster
 FLAT = {"floor", "ceil", "trunc", "rint", "not", "bits", *COMPARISONS}  # operations with derivative 0
 Rule = Callable[[Graph, Node, Node], list[Node]]  # from a node and the slope of a figure by it, the slopes by its arguments
 
@@ -258,7 +258,7 @@ class Adjoint:
         if len(kept) > WIDEST:
             raise Untraceable(f"a derivative that needs {len(kept):,} numbers of a step", "use PyTorch")
         self._kept = [f"kept {number}" for number in range(len(kept))]
-        self._figures, self._size = list(seeds), len(before)
+        self.results, self._figures, self._size = tuple(results), list(seeds), len(before)
         saved, taken = ({name: _single(pair[i]) for name, pair in zip(self._kept, kept, strict=True)} for i in (0, 1))
         self._forwards = Program(trace.pruned(trace.results | saved))
         parts, out = iter(made[len(before) :]), {}
@@ -273,12 +273,12 @@ class Adjoint:
         """The numbers that the way forth keeps of a step, and the way back takes."""
         return 2 * (len(self._kept) + len(self._figures))
 
-    def start(self, held: Mapping[str, Array], steps: int) -> Course:
+    def start(self, held: Mapping[str, Array], steps: int) -> Tape:
         """Return episodes that begin with these leaves (B, ...), by dotted name, for some steps."""
-        return Course(self, held, max(2, steps))
+        return Tape(self, held, max(2, steps))
 
 
-class Course:
+class Tape:
     """Episodes that are played forwards step by step, and then backwards at once."""
 
     def __init__(self, form: Adjoint, held: Mapping[str, Array], steps: int) -> None:
@@ -297,7 +297,7 @@ class Course:
             self._call.arguments[name][self._done] = value
         self._call.play(1)
         self._done += 1
-        return {name: column[self._done - 1] for name, column in self.results.items() if name not in self._form._kept}
+        return {name: self.results[name][self._done - 1] for name in self._form.results}
 
     def backwards(self, slopes: Mapping[str, Array]) -> dict[str, Array]:
         """Return the slopes of a figure by the arguments of all steps (K, B, ...), from its slopes (K, B) by results."""
@@ -314,10 +314,9 @@ class Course:
 
     def _column(self, name: str, slopes: Mapping[str, Array]) -> Array:
         """Return an argument of the way back, of all steps that were played."""
-        if name in self._form._kept:
-            return self.results[name][: self._done]
-        if name in self._call.arguments:
-            return self._call.arguments[name][: self._done]
+        for held in (self.results, self._call.arguments):
+            if name in held:
+                return held[name][: self._done]
         return slopes[name.removeprefix("slope ")]
 
 

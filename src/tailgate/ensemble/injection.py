@@ -18,8 +18,7 @@ from tailgate.base.pytree import leaves
 from tailgate.core import Array, Kind
 from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import Loop
-from tailgate.engine import adjoint
-from tailgate.engine.adjoint import Adjoint
+from tailgate.engine.adjoint import Adjoint, Tape
 from tailgate.engine.parameters import lifted
 from tailgate.engine.torch_form import TorchForm, tensor, torch
 from tailgate.engine.tracing import Trace, traced
@@ -116,22 +115,22 @@ class Injection:
         """Return which values (B, N, w) of a schedule are sent, and the step (B,) of the schedule."""
         return (on & (count < length))[:, None, None] & self.loop.brief.granted, np.minimum(count, length - 1)
 
-    def course(self, keys: Keys, schedule: Array) -> tuple[adjoint.Course, Array, Array]:
+    def taped(self, keys: Keys, schedule: Array) -> tuple[Tape, Array, Array]:
         """Play episodes by machine code; return them with what is sent (K, B, N, w), and the steps of the schedule (K, B)."""
         assert isinstance(self._form, Adjoint)
         begun, rows = self._begun(keys), np.arange(len(keys.key))
-        course, on, count = self._form.start(leaves(begun), self.loop.horizon), begun["on"], begun["count"]
+        tape, on, count = self._form.start(leaves(begun), self.loop.horizon), begun["on"], begun["count"]
         sends, places = [], []
         for _ in range(self.loop.horizon):
             sent, place = self.sent(on, count, schedule.shape[-3])
             value = np.where(sent, schedule[place if schedule.ndim == 3 else (rows, place)], 0.0) if sent.any() else np.zeros(sent.shape)
-            made = course.step({"value": value})
+            made = tape.step({"value": value})
             on, count = made["on"], made["count"]
             sends.append(sent)
             places.append(place)
             if made["over"].all():
                 break
-        return course, np.stack(sends), np.stack(places)
+        return tape, np.stack(sends), np.stack(places)
 
 
 def _compiled(trace: Trace) -> Adjoint | None:
@@ -147,19 +146,19 @@ class _Injected(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, schedule: torch.Tensor, injection: Injection, keys: Keys) -> tuple[torch.Tensor, ...]:
-        ctx.shape, ctx.played = schedule.shape, injection.course(keys, schedule.detach().numpy())
-        course, sends, _ = ctx.played
-        gap, error, over = (course.results[name][: len(sends)] for name in ("gap", "error", "over"))
+        ctx.shape, ctx.played = schedule.shape, injection.taped(keys, schedule.detach().numpy())
+        tape, sends, _ = ctx.played
+        gap, error, over = (tape.results[name][: len(sends)] for name in ("gap", "error", "over"))
         live = torch.from_numpy(~over)
         ctx.mark_non_differentiable(live)
         return torch.from_numpy(gap), torch.from_numpy(error), live
 
     @staticmethod
     def backward(ctx: Any, *slopes: torch.Tensor) -> tuple[torch.Tensor, None, None]:
-        course, sends, places = ctx.played
-        found = np.where(sends, course.backwards({"gap": slopes[0].numpy(), "error": slopes[1].numpy()})["value"], 0.0)
+        tape, sends, places = ctx.played
+        found = np.where(sends, tape.backwards({"gap": slopes[0].numpy(), "error": slopes[1].numpy()})["value"], 0.0)
         out, used = np.zeros(ctx.shape), sends.any(axis=(2, 3))
-        rows = np.broadcast_to(np.arange(course.episodes), used.shape)[used]
+        rows = np.broadcast_to(np.arange(tape.episodes), used.shape)[used]
         np.add.at(out, places[used] if out.ndim == 3 else (rows, places[used]), found[used])
         return torch.from_numpy(out), None, None
 

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from tailgate.agents.policy.zoo import zoo_names
-from tailgate.agents.scripts.triggers import Trigger
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array
 from tailgate.core.registry import Spec, entries
@@ -132,12 +131,6 @@ def _white_box(hunt: Hunt) -> list[str]:
 
 def _gradient(hunt: Hunt) -> list[str]:
     """Follow the derivatives of the closed loop, from the best scripts of false data."""
-    loop = hunt.arena.loop
-    if loop.model.agents > 1 and hunt.arena.space.families:
-        from tailgate.ensemble.injection import Injection
-
-        if not Injection(loop, Trigger()).compiled:
-            raise NotApplicable("agents", loop.model.agents, "1: PyTorch takes half a minute for a gradient through this loop")
     scripts = [one.attack for one in hunt.found.get("scripts", []) if one.attack.partition(":")[0] in ("fdi", "fdi_ramp")]
     return [one.attack for one in gradient(hunt.arena, hunt.budget.pace, hunt.folder / "programs", hunt.seed, hunt.tell, scripts)]
 
