@@ -1,5 +1,7 @@
 """Derivatives by machine code, compared with those of PyTorch."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -64,6 +66,7 @@ def test_each_operation_has_the_slope_of_pytorch(name):
 ])  # fmt: skip
 def test_whole_loops_have_the_slopes_of_pytorch(scenario, defence, horizon):
     place, spec = load_scenario(scenario).with_threat(kinds=("fdi",), onset=2, end=None, budget=None), Spec("defence", defence)
+    place = dataclasses.replace(place, horizon=horizon)
     loop = place.loop(spec.make(), spec.entry.uses)
     both = [Injection(loop, Trigger(), compiled) for compiled in (True, False)]
     assert [one.compiled for one in both] == [True, False]
