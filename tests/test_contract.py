@@ -66,7 +66,7 @@ def test_every_defence_applies_somewhere():
         load_scenario(PLACE[name]).loop(tailgate.make_defence(name), entries("defence")[name].uses)
 
 
-@pytest.mark.thin(4)
+@pytest.mark.thin(8)
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_rows_of_a_defence_do_not_depend_on_their_batch(defence, short, play):
     """trace_hash of each seed is the same in batches of 1, 7 and 64, in which some readings are falsified and others jammed."""

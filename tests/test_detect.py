@@ -205,6 +205,7 @@ def test_a_board_that_has_its_figures_is_left_alone_with_a_word(board: Data, tmp
     assert "the board is as it was" in capsys.readouterr().err and json.loads(path.read_text()) == board
 
 
+@pytest.mark.long
 def test_an_honest_detection_board_comes_out_equal(board: Data) -> None:
     """Figures of fields that a board of before lacks are not asked for."""
     for entry in board["entries"]:

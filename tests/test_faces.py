@@ -359,7 +359,7 @@ def test_the_documentation_runs_as_written(tmp_path):
     text = (ROOT / "docs/environment.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```python\n(.*?)```", text, flags=re.S)
     assert len(blocks) == 6 and all("learn(150_000)" in block for block in blocks[1:3])
-    code = "\n".join(blocks).replace("learn(150_000)", "learn(7_000)")
+    code = "\n".join(blocks).replace("learn(150_000)", "learn(3_000)")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "mine.json").is_file() and (tmp_path / "mine.safetensors").is_file()

@@ -257,8 +257,9 @@ def test_the_card_and_the_schema_describe_every_column(made: tuple[Path, dict[st
 @pytest.mark.parametrize(
     ("scenario", "defence", "attack", "names"),
     [
+        ("radar-following-v0", "kf", "noise_jam:start_step=20", {"energy", "probed"}),
         ("platoon-v2v-v0", "kf", "fdi:value=3", {"message_leader_acceleration", "truth_attacked_predecessor_command", "reading_distance"}),
-        ("radar-following-v0", "kf", "noise_jam:start_step=20", {"energy", "probed"}), ("network-weak-v0", "dkf", "fdi:value=5", {"innovation_y1", "estimate_9"}),
+        ("network-weak-v0", "dkf", "fdi:value=5", {"innovation_y1", "estimate_9"}),
     ],
 )  # fmt: skip
 def test_every_kind_of_plant_has_a_log(tmp_path: Path, scenario: str, defence: str, attack: str, names: set[str]) -> None:

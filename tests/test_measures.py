@@ -4,8 +4,6 @@ import copy
 import importlib.util
 import json
 import re
-import subprocess
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +22,7 @@ from tailgate.board.files import read_board
 from tailgate.board.head import lines
 from tailgate.board.measures import VAGUE
 from tailgate.board.run import board_of, play
+from tailgate.cli import main
 from tailgate.core import Array, Mode, Model
 from tailgate.core.scenario import Suite, load_suite
 from tailgate.core.threat import KNOWLEDGE
@@ -340,18 +339,20 @@ def test_the_terminal_has_the_columns(small: tuple[Suite, Path]) -> None:
     assert all(len(row) == len(heads) for row in rows) and next(row for row in rows if row[0] == "stand_still")[5].startswith("100 %")
 
 
-def test_evaluate_and_a_score_make_the_board_of_a_suite_v1(tmp_path: Path) -> None:
+def test_evaluate_and_a_score_make_the_board_of_a_suite_v1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """By the command line: some defences and attacks of quick-v1, few episodes, scored; the same rows by `build`."""
-    rows, run = tmp_path / "quick-v1" / "rows.jsonl", [sys.executable, "-m", "tailgate"]
+    rows = tmp_path / "quick-v1" / "rows.jsonl"
     given = ["--defence", "none", "--defence", "kf", "--defence", "brake_kf", "--attack", "none", "--attack", "fdi:start_step=200,value=-4"]
-    subprocess.run([*run, "evaluate", "--suite", "quick-v1", *given, "--seeds", "4", "--out", str(rows)], check=True, capture_output=True)
-    shown = subprocess.run([*run, "leaderboard", "run", "quick-v1", "--out", str(tmp_path), "--score-only", "--unattacked", "--no-replays"], check=True, capture_output=True, text=True)
-    assert "brake_kf" in shown.stdout and "hit" not in shown.stderr
+    assert main(["evaluate", "--suite", "quick-v1", *given, "--seeds", "4", "--out", str(rows)]) == 0
+    capsys.readouterr()
+    assert main(["leaderboard", "run", "quick-v1", "--out", str(tmp_path), "--score-only", "--unattacked", "--no-replays"]) == 0
+    shown = capsys.readouterr()
+    assert "brake_kf" in shown.out and "hit" not in shown.err
     made = json.loads((tmp_path / "quick-v1" / "board.json").read_text())
     assert made["suite"]["progress"] == 0.5 and {p["attacks"] for e in made["entries"] for p in e["pointwise"]} <= {1}
     assert len(read_rows(rows)) == 3 * 2 * 2 * 4
-    built = subprocess.run([*run, "leaderboard", "build", "--rows", str(rows), "--out", str(tmp_path / "page")], check=True, capture_output=True, text=True)
-    assert Path(built.stdout.strip()).is_file()
+    assert main(["leaderboard", "build", "--rows", str(rows), "--out", str(tmp_path / "page")]) == 0
+    assert Path(capsys.readouterr().out.strip()).is_file()
 
 
 def test_a_network_has_the_pointwise_worst_alone() -> None:

@@ -286,7 +286,7 @@ def test_sensors_need_a_told_noise():
         PlatoonSensors().matrices(make("plant", "sensor_network"))
 
 
-@pytest.mark.thin(12)
+@pytest.mark.thin(30)
 @pytest.mark.parametrize("name", PLATOONS)
 def test_every_scenario_has_a_manoeuvre_and_is_driven_without_a_collision(name):
     """The leader's speed changes by metres per second after the onset of attacks, and nobody collides without one."""

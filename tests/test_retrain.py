@@ -16,20 +16,19 @@ from tailgate.training import train
 
 SETTINGS = ["scenario=gusty-stop-and-go-v0", "defence=kf", "seeds=2", "workers=1", "tensorboard=false", "environment.interval=5"]
 SMALL = {
+    "cem": ["learner=cem", "teacher=null", "steps=20000", "cem={population: 8, episodes: 4, hidden: []}"],
     "ppo": ["learner=ppo", "teacher=best", "select_episodes=8", "steps=1280", "rivals=['dos_jam:trigger=near,threshold=40']",
             "ppo={envs: 16, rollout: 40, batch_size: 160, epochs: 2, hidden: [16]}"],
-    "cem": ["learner=cem", "teacher=null", "steps=20000", "cem={population: 8, episodes: 4, hidden: []}"],
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module", params=SMALL)
+@pytest.fixture(scope="module", params=["cem", pytest.param("ppo", marks=pytest.mark.long)])
 def policies(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     out = tmp_path_factory.mktemp("runs")
     config = train.load_config(None, [*SETTINGS, *SMALL[request.param], f"out={out}", f"name={request.param}"])
     return train.train(config, lambda seed, now: None)
 
 
-@pytest.mark.thin(2)
 def test_the_weights_come_out_again(policies: list[Path]) -> None:
     """Also of the second seed alone, and where the teacher was chosen among the rivals."""
     found = [retrain(str(path)) for path in policies]

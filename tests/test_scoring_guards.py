@@ -85,6 +85,7 @@ def test_a_rank_takes_every_training_of_the_plan(tmp_path: Path) -> None:
     assert status(short)[0] == "unattacked" and status(short)[1].startswith("2 of 2")
 
 
+@pytest.mark.long
 def test_attackers_of_networks_of_two_shapes_play_where_they_fit(tmp_path: Path) -> None:
     """The command trains on both, plays each policy on its own, and the defence is ranked: nothing of the plan is missing."""
     learners = {"cem": ["steps=400", "cem={population: 4, episodes: 1, hidden: []}"]}

@@ -95,7 +95,7 @@ def _fits(text, brief):
     return True
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(6)
 @pytest.mark.parametrize(
     "name", ["quick-v0", "car-following-v0", "platoon-v0", "radar-v0", "network-v0", "thesis-v0", pytest.param("highway-v0", marks=pytest.mark.long)]
 )
