@@ -143,6 +143,7 @@ def test_an_attack_changes_only_what_is_granted_and_when(attack, short, play):
         assert changed[trace.kind != 0].any()
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_before_onset_an_attacked_episode_is_the_clean_one(attack, short, play):
     """Every signal up to the onset, except what was asked for in vain, equals the clean run bit for bit."""
@@ -155,7 +156,7 @@ def test_before_onset_an_attacked_episode_is_the_clean_one(attack, short, play):
         assert not np.array_equal(attacked.estimate[24:], clean.estimate[24:])
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_swapping_the_defence_leaves_the_world_draws(defence, short, play, monkeypatch):
     """Clean runs of two defences draw the same numbers for the world: comparisons are paired."""
@@ -181,7 +182,7 @@ def test_swapping_the_defence_leaves_the_world_draws(defence, short, play, monke
     np.testing.assert_allclose(noise[0][heard], noise[1][heard], atol=1e-2 if traces[0].model.air else 1e-9)
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(5)
 @pytest.mark.parametrize("batch", [1, 2, 3, 4, 10])
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_restart(defence, batch, short, loop_of, same_tree):
@@ -207,6 +208,7 @@ def test_restart(defence, batch, short, loop_of, same_tree):
         state = after
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_a_restarted_row_plays_on_as_a_fresh_one(defence, short, loop_of):
     """The frames of a restarted row are those of the same episode started alone."""
@@ -265,6 +267,7 @@ def test_a_defence_gets_only_what_its_card_declares(defence, short):
     assert all((r.odometry is not None) == ("odometry" in uses) for r in seen)
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_a_white_box_cannot_write_into_the_defence(defence, short, loop_of):
     """Whatever of plan and state can be written is a copy: an episode with a vandal equals the plain one."""

@@ -80,6 +80,7 @@ def test_a_defence_runs_and_its_rows_do_not_depend_on_their_batch(defence, place
     assert [some.trace_hash(0), some.trace_hash(1), alone.trace_hash(0)] == [known[2], known[0], known[1]]
 
 
+@pytest.mark.thin(4)
 @each
 def test_a_restarted_row_is_a_fresh_one(defence, place, same_tree):
     """Restarted rows equal fresh rows of the next episode and play on like them; the others keep every bit; every leaf has B first."""

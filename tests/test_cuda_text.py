@@ -135,6 +135,7 @@ def test_loops_products_and_shared_numbers() -> None:
     assert len(set(wanted["n"])) > 5
 
 
+@pytest.mark.long
 def test_nothing_is_undefined_in_c(tmp_path: Any) -> None:
     """No overflow with a sign, no conversion beyond a type, no shift too far: a card would do otherwise than this processor."""
     checks = "-fsanitize=undefined -fsanitize=float-cast-overflow -fsanitize-undefined-trap-on-error"

@@ -91,6 +91,7 @@ def test_the_median():
         assert x[0] == pytest.approx(1.1, abs=1e-7)
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("s, least", [(0, 40), (1, 40), (2, 38), (3, 33)])
 def test_noise_free_recovery(s, least):
     """Seven sensors of three states, 100 randn on s of them: exact, for s = 3 in most cases; the relaxation may fail. A million times the attack changes nothing."""

@@ -105,7 +105,7 @@ def test_the_checker_passes_with_its_render_check(name, strict, monkeypatch):
     check_env(gymnasium.make(name).unwrapped)
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(7)
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_the_id_works_in_a_fresh_interpreter(name):
     """Gymnasium alone imports the module that the id names."""

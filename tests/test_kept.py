@@ -71,6 +71,7 @@ def test_of_an_entry_whose_cells_changed_nothing_is_kept(folder: Path, board: Da
     assert again["detection"] == board["detection"] | {"without": []}
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("key", ["hash", "version", "beacon"])
 def test_nothing_is_kept_of_a_board_of_something_else(folder: Path, board: Data, key: str) -> None:
     board["suite"][key] = "another"

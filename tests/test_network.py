@@ -267,6 +267,7 @@ def test_a_platoon_of_fifty_cars_is_detectable_with_its_neighbours_and_not_witho
     np.testing.assert_allclose(np.abs(basis[:, 0]), np.eye(held.states)[0], atol=1e-9)
 
 
+@pytest.mark.thin(5)
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.long] if name == "network-large-v0" else []) for name in NETWORKS])  # it takes long to plan
 def test_metrics_of_a_network(name):
     """The error is the 2-norm of the state's; nothing drives, so that the road's metrics are undefined and nobody crashes."""

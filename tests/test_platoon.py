@@ -20,7 +20,7 @@ from tailgate.play.trace import rollout
 
 TOPOLOGIES = ("predecessor_leader", "predecessor", "bidirectional", "two_predecessor")
 LAWS = {"cacc": {}, "ploeg_cacc": {}, "consensus_cacc": {"leader": "estimated"}}
-PLATOONS = [name for name in list_scenarios() if name.startswith("platoon-")]
+PLATOONS = sorted((name for name in list_scenarios() if name.startswith("platoon-")), key=lambda name: name != "platoon-braking-v0")
 
 
 def law_of(name, **changes):

@@ -155,7 +155,7 @@ def test_a_damaged_curve_is_refused(tmp_path, text):
         spent(tmp_path / "curve-0.json")
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(8)
 @pytest.mark.parametrize("name", ["training preset", "rows", "compressed rows", "policy", "policy's tensors", "card", "speed profile", "formulas"])
 def test_a_sample_of_the_campaign_ends_well(name):
     valid = valid_of(name)

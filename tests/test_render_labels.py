@@ -90,7 +90,7 @@ def seats(stage, sheet):
     return [(car, sheet.seat(car)) for car in stage.cars if -20 < sheet.column(car.x) < sheet.width + 20]
 
 
-@pytest.mark.thin(30)
+@pytest.mark.thin(60)
 @pytest.mark.parametrize("size", SIZES, ids=str)
 @pytest.mark.parametrize("name", SCENES)
 def test_no_word_covers_another_or_a_car(name, size, episodes, witness):

@@ -46,6 +46,7 @@ def chapter_7():
     return {claim.id: claim for claim in report.claims}
 
 
+@pytest.mark.long
 def test_chapter_7(chapter_7):
     """What has to come out whatever the seeds."""
     held = {name: claim.holds for name, claim in chapter_7.items()}

@@ -78,6 +78,7 @@ def test_a_file_may_name_a_class_in_a_sandbox_and_none_without(tmp_path: Path, f
     assert not Spec("defence", MINE).imports and Spec("defence", MINE).target == "mine:Mine" and len(Spec("defence", MINE).digest) == 64
 
 
+@pytest.mark.long
 def test_from_a_submission_to_a_rank_that_others_verify(folder: Path, tmp_path: Path) -> None:
     """The round's rows, those of the attackers that were trained against the class in its sandbox, its rank; and each row played again."""
     rows = evaluate(SMALL, beacon=BEACON) + play_submission("mine:Mine", SMALL, sandbox="bwrap", beacon=BEACON)

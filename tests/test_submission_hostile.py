@@ -261,7 +261,7 @@ def _hostile(world: Path, how: str, *, others: bool, sandbox: str = "", **limits
     return rows
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(5)
 @pytest.mark.parametrize(
     ("how", "reason", "limits"),
     [
@@ -282,7 +282,7 @@ def test_what_ends_a_process_costs_its_scenario_and_no_other(world: Path, how: s
     assert {(row["status"], row["reason"][: len(reason)]) for row in rows} == {("error", reason)}
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(5)
 @pytest.mark.parametrize(
     ("how", "reason", "limits"),
     [
@@ -318,8 +318,8 @@ def test_processes_that_change_their_session_are_dead_afterwards(world: Path) ->
     assert {row["status"] for row in rows} == {"ok"}
 
 
+@pytest.mark.thin(7)
 @pytest.mark.skipif(shutil.which("bwrap") is None, reason="bubblewrap is not installed")
-@pytest.mark.thin(3)
 @pytest.mark.parametrize(
     ("how", "reason", "limits"),
     [

@@ -78,6 +78,7 @@ def test_transferred_beats_own_is_flagged(tmp_path: Path, half_place: str) -> No
     assert transfer_figure(report)[:4] == b"\x89PNG"
 
 
+@pytest.mark.long
 def test_all_defences_are_those_that_have_a_meaning_there() -> None:
     """First what was trained on, then what suites play in the scenario; everybody else is named with a reason."""
     report = transfer([ZOO], ["all"], episodes=1)

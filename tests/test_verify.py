@@ -82,7 +82,7 @@ def test_a_row_is_the_same_in_a_batch_of_4096() -> None:
     assert verify(run([cell]), batch=4096)["counts"] == {"verified": 4100, "differs": 0, "unchecked": 0}
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(6)
 @pytest.mark.parametrize(("suite", "scenario", "dose", "defence", "attack", "seeds"), [
     ("car-following-v0", "car-following-noisy-v0", 10, "chi2_kf", "stealth:trigger=near,threshold=40", 60),
     ("car-following-v0", "car-following-lossy-v0", 10, "imm", "zoo:name=car-following-chi2_kf-0", 40),
@@ -118,6 +118,7 @@ def test_rows_of_boards_are_the_same_in_any_batch_company_and_order(
     assert verify(some, workers=2, batch=7)["counts"] == {"verified": len(some), "differs": 0, "unchecked": 0}
 
 
+@pytest.mark.long
 def test_rows_of_a_radar_a_platoon_and_a_network_are_the_same_too() -> None:
     """Filters of one car and of many agents, over the air and on wires: side by side, three at once in two processes, and each by itself."""
     cells = [

@@ -132,6 +132,7 @@ def test_a_loop_has_one_bare_loop() -> None:
     assert loop.bare is loop.bare and loop.bare.bare is loop.bare and not isinstance(loop.bare.defence, Watched)
 
 
+@pytest.mark.long
 def test_filters_and_challenges_have_figures_of_detection() -> None:
     """A challenge is answered by a jump of the energy; a filter sees a late echo at once, and a stealthy attacker stays below its chi-square."""
     effort = Effort((0.02,), 8, 20, 40_000)
