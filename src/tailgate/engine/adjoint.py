@@ -7,7 +7,7 @@ Comparisons, roundings and conversions to whole numbers have derivative 0.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from tailgate.engine.program import Call, Program
 from tailgate.engine.tracing import Trace
 from tailgate.engine.untraceable import Untraceable
 
-LONGEST, WIDEST = 20_000, 1000  # most operations of a step, and numbers kept of it: with 4163 of these PyTorch was faster
+LONGEST = 30_000  # operations of a step, at most: more take minutes to compile
 FLAT = {"floor", "ceil", "trunc", "rint", "not", "bits", *COMPARISONS}  # operations with derivative 0
 Rule = Callable[[Graph, Node, Node], list[Node]]  # from a node and the slope of a figure by it, the slopes by its arguments
 
@@ -52,6 +52,8 @@ class Straight:
                 continue
             if node.op == "input":
                 self._made[node.id] = self.given[node] = node
+            elif node.op == "held":
+                self._buffers[node.id] = [self._given(one) for one in graph.picks(node)]
             elif node.size:
                 self._buffers[node.id] = self._buffer(node)
             else:
@@ -67,6 +69,10 @@ class Straight:
             return self._made[node.id]
         if is_pick(node) and node.args[0].id in self._buffers:
             return self._buffers[node.args[0].id][int(node.attr)]
+        return self._given(node)
+
+    def _given(self, node: Node) -> Node:
+        """Return the input that has a number of the trace."""
         if node not in self.given:
             self.given[node] = self.graph.input(("given", node.id), node.dtype)
         return self.given[node]
@@ -81,11 +87,13 @@ class Straight:
     def _buffer(self, node: Node) -> list[Node]:
         """Return the numbers of a buffer."""
         if node.op == "matvec":
-            matrix, there, _ = node.attr
-            numbers = [self.number(a) for a in node.args]
-            return self.graph.matvec(matrix, numbers[: matrix.shape[1]], numbers[matrix.shape[1] :], there)
+            return _multiplied(self.graph, node, [self.number(a) for a in node.args])
         if node.op == "pack":
             return [one for piece in node.attr for one in self._piece(piece)]
+        if node.op == "blend":
+            where, *sides = node.args
+            chosen = self.number(where)
+            return [self.graph.select(chosen, *map(self.number, pair)) for pair in zip(*map(self.graph.picks, sides), strict=True)]
         if node.op == "sweep":
             return [one for place in np.ndindex(*node.attr.shape) for one in self._round(node.attr, place)]
         raise Untraceable(f"a derivative of {node.op}", "use operations on numbers, or PyTorch")
@@ -102,11 +110,18 @@ class Straight:
     def _round(self, body: Sweep, place: tuple[int, ...]) -> list[Node]:
         """Return the results of one round of a sweep."""
         mine = {one.id: self._element(source, place) for one, source in zip(body.carried, body.sources, strict=True)}
+        products: dict[int, list[Node]] = {}
 
         def found(node: Node) -> Node:
             return mine[node.id] if node.id in mine else self.number(node)
 
         for node in body.nodes:
+            if node.op == "matvec":
+                products[node.id] = _multiplied(self.graph, node, [found(a) for a in node.args])
+                continue
+            if is_pick(node) and node.args[0].id in products:
+                mine[node.id] = products[node.args[0].id][int(node.attr)]
+                continue
             if node.size or is_pick(node) or node.op in ("loop", "call", "gather"):
                 raise Untraceable(f"a derivative of {node.op} in a sweep", "use operations on numbers, or PyTorch")
             mine[node.id] = _again(self.graph, node, [found(a) for a in node.args])
@@ -122,6 +137,12 @@ def _again(graph: Graph, node: Node, args: list[Node]) -> Node:
     if node.op == "bits":
         return graph.bits(args[0], node.dtype)
     return graph.unary(node.op, args[0]) if len(args) == 1 else graph.binary(node.op, args[0], args[1])
+
+
+def _multiplied(graph: Graph, node: Node, args: list[Node]) -> list[Node]:
+    """Return the product of a matrix with other arguments, number by number."""
+    matrix, there, _ = node.attr
+    return graph.matvec(matrix, args[: matrix.shape[1]], args[matrix.shape[1] :], there)
 
 
 def _check(node: Node) -> None:
@@ -221,7 +242,10 @@ _RULES: dict[str, Rule] = {
 
 
 class Adjoint:
-    """The machine code of a trace forwards, and of its derivatives backwards."""
+    """The machine code of a trace forwards, and of its derivatives backwards.
+
+    numbers: how many of each step the way forth keeps and the way back takes, together.
+    """
 
     def __init__(self, trace: Trace, results: Sequence[str], figures: Sequence[str]) -> None:
         """Compile both ways.
@@ -238,40 +262,34 @@ class Adjoint:
         Raises
         ------
         Untraceable
-            For an operation without a rule, and for moving numbers of a state that lie in a buffer.
+            For an operation without a rule, and for a step that is too large.
         """
         trace, graph = trace.pruned({name: trace.results[name] for name in results}), trace.graph
         asked = {name: nodes.item() for name, nodes in trace.results.items()}
         pairs = [pair for name in trace.state for pair in trace.pairs(name)]
         given = [node for nodes in trace.arguments.values() for node in nodes.flat]
-        reached = moving(ordered([*asked.values(), *(new for _, new in pairs)]), given, pairs)
-        state = [(now, new) for now, new in pairs if now.id in reached]
+        numbers = [_each(graph, *pair) for pair in pairs]
+        reached = moving(ordered([*asked.values(), *(new for several in numbers for _, new in several)]), given, pairs)
+        state = [one for (now, _), several in zip(pairs, numbers, strict=True) if now.id in reached for one in several]
         ends = [asked[name] for name in figures if asked[name].id in reached] + [new for _, new in state if new.id in reached]
         straight = Straight(graph, reached, ends)
-        before = [(now, straight.number(new), graph.input(("slope", now.id), FLOAT)) for now, new in state]
+        before = [(straight.number(now), straight.number(new), graph.input(("slope", now.id), FLOAT)) for now, new in state]
         seeds = {name: graph.input(("slope", name), FLOAT) for name in figures if asked[name].id in reached}
         begun = [*((straight.number(asked[name]), slope) for name, slope in seeds.items()), *((new, slope) for _, new, slope in before)]
         wanted = [*(now for now, *_ in before), *given]
         made = backwards(graph, moving(ordered(node for node, _ in begun), wanted, []), begun, wanted)
         needed, own = {node.id for node in ordered(made)}, {node.id for node in given}
         kept = [(node, place) for node, place in straight.given.items() if place.id in needed and place.id not in own]
-        if len(kept) > WIDEST:
-            raise Untraceable(f"a derivative that needs {len(kept):,} numbers of a step", "use PyTorch")
-        self._kept = [f"kept {number}" for number in range(len(kept))]
-        self.results, self._figures, self._size = tuple(results), list(seeds), len(before)
-        saved, taken = ({name: _single(pair[i]) for name, pair in zip(self._kept, kept, strict=True)} for i in (0, 1))
+        self.results, self._size, kinds = tuple(results), len(before), sorted({node.dtype for node, _ in kept}, key=str)
+        self.numbers = 2 * (len(kept) + len(seeds))
+        saved, taken = ({f"kept {kind}": _row(pair[i] for pair in kept if pair[0].dtype == kind) for kind in kinds} for i in (0, 1))
         self._forwards = Program(trace.pruned(trace.results | saved))
         parts, out = iter(made[len(before) :]), {}
         for name, held in trace.arguments.items():
             out[name] = np.array([next(parts) for _ in held.flat], object).reshape(held.shape)
-        slopes = {"slope": (np.array([[slope for *_, slope in before]], object), np.array([made[: len(before)]], object))} if before else {}
-        taken |= trace.arguments | {f"slope {name}": _single(slope) for name, slope in seeds.items()}
+        slopes = {"slope": (_row(slope for *_, slope in before), _row(made[: len(before)]))} if before else {}
+        taken |= trace.arguments | {f"slope {name}": np.array([slope], object) for name, slope in seeds.items()}
         self._backwards = Program(Trace(graph, slopes, taken, out, None))
-
-    @property
-    def numbers(self) -> int:
-        """The numbers that the way forth keeps of a step, and the way back takes."""
-        return 2 * (len(self._kept) + len(self._figures))
 
     def start(self, held: Mapping[str, Array], steps: int) -> Tape:
         """Return episodes that begin with these leaves (B, ...), by dotted name, for some steps."""
@@ -320,5 +338,10 @@ class Tape:
         return slopes[name.removeprefix("slope ")]
 
 
-def _single(node: Node) -> Array:
-    return np.array([node], object)
+def _each(graph: Graph, now: Node, new: Node) -> list[tuple[Node, Node]]:
+    """Return the numbers of a leaf of the state, now and next, one by one."""
+    return list(zip(graph.picks(now), graph.picks(new), strict=True)) if now.size else [(now, new)]
+
+
+def _row(nodes: Iterable[Node]) -> Array:
+    return np.array([[*nodes]], object)
