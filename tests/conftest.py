@@ -46,6 +46,13 @@ def pytest_collection_modifyitems(config, items):
             item.add_marker(pytest.mark.skip(reason="long: make test-long"))
 
 
+def pytest_runtest_setup(item):
+    """The random numbers of a module begin anew in each test: none depends on those that ran before it."""
+    rng = getattr(item.module, "RNG", None)
+    if isinstance(rng, np.random.Generator):
+        rng.bit_generator.state = np.random.PCG64(rng.bit_generator.seed_seq).state
+
+
 def _same_bits(a, b):
     a, b = np.ascontiguousarray(a), np.ascontiguousarray(b)
     return a.shape == b.shape and a.dtype == b.dtype and a.tobytes() == b.tobytes()

@@ -215,7 +215,7 @@ def test_an_observer_bank_forgets_how_large_an_attack_is(linear_model, kind):
 def test_the_spread_of_two_filters_is_the_difference_of_their_covariances(linear_model):
     """cov(x_J - x_S) = P_S - P_J, on 4000 matched runs."""
     model = dense(linear_model, RNG, n=2, q=4, Q=0.1)
-    _, ys = simulated(model, 60, 4000, RNG)
+    _, ys = simulated(model, 600, 4000, RNG)
     plan, out = play_readings(ObserverBank(s=1), model, ys)
     state = out[-1][0]
     off = state.most[:, 0, :, :, None] - state.fewer[:, 0][:, :, plan.inside]
