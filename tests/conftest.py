@@ -47,7 +47,7 @@ def pytest_collection_modifyitems(config, items):
 
 
 def pytest_runtest_setup(item):
-    """The random numbers of a module begin anew in each test: none depends on those that ran before it."""
+    """Reset the generator RNG of a test's module, so that no test depends on those before it."""
     rng = getattr(item.module, "RNG", None)
     if isinstance(rng, np.random.Generator):
         rng.bit_generator.state = np.random.PCG64(rng.bit_generator.seed_seq).state

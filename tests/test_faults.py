@@ -227,7 +227,7 @@ def test_a_list_of_attacks_survives_every_kill(tmp_path: Path, kill_at: Any) -> 
 
 @pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.long), 3])
 def test_a_process_that_dies_at_any_step_leaves_nothing_broken(tmp_path: Path, every: int) -> None:
-    """os._exit at every call: nothing is tidied up, and the rerun still gives the same bytes and leaves no temporary file."""
+    """os._exit at a call of the hook: nothing is tidied up, and the rerun still gives the same bytes and leaves no temporary file."""
     last = _all_die("rows", tmp_path, every)
     assert last > 12
     whole = (tmp_path / str(last) / "rows.jsonl").read_bytes()

@@ -43,7 +43,7 @@ def _whole(result: dict[str, Any], folder: Path) -> str:
 def test_an_interrupted_search_goes_on(job: standard.Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Networks begin with scripts of the journal; the result is that of a search in one go, and no journal is left."""
     (straight,) = standard.searched([job], tmp_path / "one")
-    for stop in ("networks", "gradient"):
+    for stop in ("networks", "grey networks", "gradient"):
         _counted(monkeypatch, stop)
         with pytest.raises(KeyboardInterrupt):
             standard.search(job, tmp_path / "two")

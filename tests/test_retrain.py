@@ -16,9 +16,9 @@ from tailgate.training import train
 
 SETTINGS = ["scenario=gusty-stop-and-go-v0", "defence=kf", "seeds=2", "workers=1", "tensorboard=false", "environment.interval=5"]
 SMALL = {
-    "cem": ["learner=cem", "teacher=null", "steps=20000", "cem={population: 8, episodes: 4, hidden: []}"],
     "ppo": ["learner=ppo", "teacher=best", "select_episodes=8", "steps=1280", "rivals=['dos_jam:trigger=near,threshold=40']",
             "ppo={envs: 16, rollout: 40, batch_size: 160, epochs: 2, hidden: [16]}"],
+    "cem": ["learner=cem", "teacher=null", "steps=20000", "cem={population: 8, episodes: 4, hidden: []}"],
 }  # fmt: skip
 
 

@@ -85,6 +85,7 @@ def test_a_row_is_the_same_in_a_batch_of_4096() -> None:
 @pytest.mark.thin(6)
 @pytest.mark.parametrize(("suite", "scenario", "dose", "defence", "attack", "seeds"), [
     ("car-following-v0", "car-following-noisy-v0", 10, "chi2_kf", "stealth:trigger=near,threshold=40", 60),
+    pytest.param("car-following-v0", "car-following-noisy-v0", 10, "chi2_kf", "stealth:trigger=near,threshold=40", 300, marks=pytest.mark.long),
     ("car-following-v0", "car-following-lossy-v0", 10, "imm", "zoo:name=car-following-chi2_kf-0", 40),
     ("radar-v0", "radar-following-v0", 4, "cra", "zoo:name=radar-following-cra-0", 40),
     ("thesis-v0", "thesis-ch3-v0", 10, "cra", "noise_jam:start_step=182", 40),
@@ -94,7 +95,7 @@ def test_a_row_is_the_same_in_a_batch_of_4096() -> None:
 def test_rows_of_boards_are_the_same_in_any_batch_company_and_order(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suite: str, scenario: str, dose: int, defence: str, attack: str, seeds: int
 ) -> None:
-    """256 and 4096 at once, one process and two, few of them alone, and where the second half of a run was stopped and played later."""
+    """A cell and 4096 at once, one process and two, few of them alone, and where the second half of a run was stopped and played later."""
     cells = [
         Cell(suite, scenario, dose, defence, text, seeds, first_seed=first, threat=load_suite(suite).granted)
         for text, first in ((attack, 0), ("none", 0), (attack, seeds))
@@ -122,13 +123,13 @@ def test_rows_of_boards_are_the_same_in_any_batch_company_and_order(
 def test_rows_of_a_radar_a_platoon_and_a_network_are_the_same_too() -> None:
     """Filters of one car and of many agents, over the air and on wires: side by side, three at once in two processes, and each by itself."""
     cells = [
-        Cell("s", "radar-braking-v0", 4, "chi2_kf", "noise_jam:trigger=leader_braking,threshold=0.3", 16),
-        Cell("s", "platoon-gusty-v0", 20, "dkf", "fdi:value=5", 4), Cell("s", "network-restless-v0", 5, "dkf", "fdi:value=5", 4),
+        Cell("s", "radar-braking-v0", 4, "chi2_kf", "noise_jam:trigger=leader_braking,threshold=0.3", 40),
+        Cell("s", "platoon-gusty-v0", 20, "dkf", "fdi:value=5", 8), Cell("s", "network-restless-v0", 5, "dkf", "fdi:value=5", 8),
     ]  # fmt: skip
     held = run(cells)
     assert {row["status"] for row in held} == {"ok"} and all(row["attack_steps"] == row["dose"] for row in held)
-    assert verify(held, batch=3, workers=2)["counts"] == {"verified": 24, "differs": 0, "unchecked": 0}
-    assert verify(held[::-7], batch=1)["counts"] == {"verified": 4, "differs": 0, "unchecked": 0}
+    assert verify(held, batch=3, workers=2)["counts"] == {"verified": 56, "differs": 0, "unchecked": 0}
+    assert verify(held[::-7], batch=1)["counts"] == {"verified": 8, "differs": 0, "unchecked": 0}
 
 
 @pytest.mark.parametrize(
