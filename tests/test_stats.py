@@ -1,15 +1,33 @@
 """Intervals: known values, repeatability, and coverage by simulation."""
 
+import sys
+
 import numpy as np
 import pytest
+import scipy.stats
 
-from tailgate.evaluation.stats import holm, mean_time, median_limits, paired_difference, paired_ratio, proportion
+from tailgate.evaluation.paired import mcnemar
+from tailgate.evaluation.stats import at_least, holm, mean_time, median_limits, paired_difference, paired_ratio, proportion
 
 
 def test_clopper_pearson_known_values() -> None:
     """36 of 36 gives [0.9026, 1]; 0 of 4 ends at 1 - 0.025^(1/4)."""
     assert proportion(36, 36) == (1.0, pytest.approx(0.9026, abs=1e-4), 1.0)
     assert proportion(0, 4) == (0.0, 0.0, pytest.approx(1 - 0.025**0.25))
+
+
+@pytest.mark.parametrize("private", [True, False])
+def test_limits_have_the_bits_of_scipys_tests(private: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Published boards hold them; also where scipy has not the private names that are fast to import."""
+    if not private:
+        monkeypatch.setitem(sys.modules, "scipy.special._ufuncs", None)
+    for n in (1, 2, 7, 100, 5120):
+        for k in range(0, n + 1, max(1, n // 20)):
+            wanted = scipy.stats.binomtest(k, n).proportion_ci(0.95, method="exact")
+            assert proportion(k, n)[1:] == (wanted.low, wanted.high), (k, n)
+            assert at_least(k, n) == scipy.stats.binom.sf(k - 1, n, 0.5)
+            assert mcnemar(k, n - k) == scipy.stats.binomtest(k, n).pvalue
+    assert mcnemar(0, 0) == 1.0
 
 
 def test_a_seed_gives_the_same_interval_twice() -> None:

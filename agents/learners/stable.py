@@ -27,7 +27,7 @@ except ImportError as error:
     raise ImportError("torch or Stable-Baselines3 is missing: pip install 'tailgate[train]'") from error
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from tailgate.agents.learners.exploring import Explorer
 from tailgate.agents.learners.learning import (
@@ -288,7 +288,7 @@ def rest_first(layer: torch.nn.Linear, probability: float, discrete: bool, log_s
     """Set the first bias of an output layer so that a fresh policy attacks with this probability in a step."""
     p = min(max(probability, 1e-6), 1.0 - 1e-6)
     with torch.no_grad():
-        layer.bias[0] = float(np.log((len(layer.bias) - 1) * (1.0 - p) / p)) if discrete else float(norm.ppf(p) * np.exp(log_std))
+        layer.bias[0] = float(np.log((len(layer.bias) - 1) * (1.0 - p) / p)) if discrete else float(ndtri(p) * np.exp(log_std))
 
 
 # -- learners with a replay buffer

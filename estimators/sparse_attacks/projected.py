@@ -134,14 +134,14 @@ class ProjectedGradient(Relaxed):
     rounds: Rounds = param(100, "gradient steps in a period, at most")
 
     def constants(self, plan: WindowPlan, model: Model) -> ProjectedPlan:
-        from scipy import stats  # takes as long to load as all the rest
+        from scipy import special  # not loaded where no threshold is made
 
         units = self.units(plan)[..., None]
         O, turn = orthonormal(plan.O * units[..., None])
         q, T, n = O.shape[1:]
         back = np.stack([num.solve(R, np.eye(n)) for R in turn])
         move = np.stack([num.product(num.product(R, model.A), inverse) for R, inverse in zip(turn, back, strict=True)])
-        h = float(stats.chi2.isf(self.alpha, max(q * T - n, 1))) if self.threshold is None else self.threshold
+        h = float(special.chdtri(max(q * T - n, 1), self.alpha)) if self.threshold is None else self.threshold
         eps = T * num.dot(units[..., 0], units[..., 0])
         return ProjectedPlan(O, turn, back, move, units, eps if self.eps is None else np.full_like(eps, self.eps), h)
 

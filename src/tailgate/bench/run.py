@@ -14,6 +14,7 @@ from tailgate.base import sizes
 from tailgate.base.errors import InputError
 from tailgate.base.provenance import commit, cpuinfo, processor
 from tailgate.base.version import VERSION
+from tailgate.evaluation.stats import at_least
 
 from .lines import RATE, Line, Missing
 from .targets import Scaling, Target, chosen, groups
@@ -57,11 +58,9 @@ def interval(values: Sequence[float], level: float = LEVEL) -> tuple[float, floa
     It is the narrowest one that covers at least `level`; where none does, from the smallest to the largest.
     No distribution is assumed, only rounds that do not depend on each other.
     """
-    from scipy.stats import binom
-
     ordered, n = sorted(values), len(values)
-    cut = max((k for k in range(1, n // 2 + 1) if 1.0 - 2.0 * float(binom.cdf(k - 1, n, 0.5)) >= level), default=1)
-    return ordered[cut - 1], ordered[n - cut], max(0.0, 1.0 - 2.0 * float(binom.cdf(cut - 1, n, 0.5)))
+    cut = max((k for k in range(1, n // 2 + 1) if 1.0 - 2.0 * float(at_least(n - k + 1, n)) >= level), default=1)
+    return ordered[cut - 1], ordered[n - cut], max(0.0, 1.0 - 2.0 * float(at_least(n - cut + 1, n)))
 
 
 def summary(line: Line, values: Sequence[float]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 from tailgate.base.errors import InputError
 from tailgate.core import Array
 from tailgate.core.registry import USES
-from tailgate.evaluation.stats import holm
+from tailgate.evaluation.stats import at_least, holm
 
 Data = dict[str, Any]
 PAIR = ("only_a", "only_b", "weaker", "p")  # what was found of two defences
@@ -39,10 +39,7 @@ def class_of(uses: Sequence[str]) -> str:
 
 def mcnemar(only_a: int, only_b: int) -> float:
     """Return the exact two-sided p of McNemar's test: of the pairs that differ, each side has half under the null hypothesis."""
-    from scipy.stats import binomtest
-
-    n = only_a + only_b
-    return float(binomtest(only_a, n).pvalue) if n else 1.0
+    return min(1.0, 2.0 * float(at_least(max(only_a, only_b), only_a + only_b)))
 
 
 def outdone(a: Harm, b: Harm, least: bool = False) -> float:
@@ -53,12 +50,10 @@ def outdone(a: Harm, b: Harm, least: bool = False) -> float:
     It is small where a is surely weaker. Where nobody knows which episodes were damaged, p is the largest that their numbers allow,
     or the least; it is 1 where b has as many.
     """
-    from scipy.stats import binom
-
     vague = a.vague[a.worst] | b.vague
     only_a, only_b = apart(a.of_worst, b.damage, vague, least)
     blank = (only_a + only_b == 0) | (vague & (only_a <= only_b))
-    p = np.where(blank, 1.0, binom.sf(only_a - 1, only_a + only_b, 0.5))
+    p = np.where(blank, 1.0, at_least(only_a, only_a + only_b))
     return float(min(1.0, len(a.damage) * p.max()))
 
 
@@ -92,8 +87,6 @@ def duel(group: str, a: str, b: str, x: Harm, y: Harm) -> Data:
 
 def credible(told: Data, here: Data, x: Harm, y: Harm) -> bool:
     """Return if a pair can have been found like that when more episodes were known than cells tell now, which give the bound `here`."""
-    from scipy.stats import binom
-
     if told.get("weaker") not in (told["a"], told["b"]):
         return False
     only = told["only_a"], told["only_b"]
@@ -105,7 +98,7 @@ def credible(told: Data, here: Data, x: Harm, y: Harm) -> bool:
         worst = np.array([x.vague[x.worst] | y.vague[y.worst]])
         few, many = (apart(x.of_worst, y.of_worst[None], worst, least)[0][0] for least in (True, False))
         fits = few <= only[0] <= many and only[0] - only[1] == here["only_a"] - here["only_b"]
-        low = max(low, len(weak.damage) * float(binom.sf(first - 1, sum(only), 0.5)))  # against the other's worst: p is the largest of all
+        low = max(low, len(weak.damage) * float(at_least(first, sum(only))))  # against the other's worst: p is the largest of all
     return bool(fits and min(1.0, 2.0 * low) * (1.0 - CLOSE) <= told["p"] <= here["p"] * (1.0 + CLOSE))
 
 

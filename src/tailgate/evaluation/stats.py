@@ -1,9 +1,10 @@
 """Confidence intervals: proportions by Clopper-Pearson, mean times by Poisson, medians by ranks, differences by a seeded bootstrap."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tailgate.core import Array
 
@@ -18,19 +19,41 @@ class Interval(NamedTuple):
 
 def proportion(successes: int, n: int, level: float = 0.95) -> Interval:
     """Return the share of successes with the exact (Clopper-Pearson) interval."""
-    from scipy import stats  # its import takes half a second
+    from scipy.optimize import brentq
 
-    ci = stats.binomtest(successes, n).proportion_ci(confidence_level=level, method="exact")
-    return Interval(successes / n, float(ci.low), float(ci.high))
+    cdf, sf = _binomial()
+    tail = (1.0 - level) / 2.0
+    low = brentq(lambda p: sf(successes - 1, n, p) - tail, 0.0, 1.0) if successes > 0 else 0.0
+    high = brentq(lambda p: cdf(successes, n, p) - tail, 0.0, 1.0) if successes < n else 1.0
+    return Interval(successes / n, low, high)
+
+
+def _binomial() -> tuple[Callable[..., Array], Callable[..., Array]]:
+    """Return the distribution function of the binomial distribution and its complement, functions of k, n and p.
+
+    Both are scipy's own, of which published limits have every bit. Its package of statistics takes longer to import than all of this one.
+    """
+    try:
+        from scipy.special._ufuncs import _binom_cdf, _binom_sf
+    except ImportError:  # the names are private
+        from scipy.stats import binom
+
+        return binom.cdf, binom.sf
+    return _binom_cdf, _binom_sf
 
 
 def limits(successes: Array, n: Array, alpha: float) -> tuple[Array, Array]:
     """One-sided Clopper-Pearson limits of shares, lower and upper, each missed with a chance of at most alpha."""
-    from scipy import stats
+    from scipy import special
 
-    low = np.where(successes > 0, stats.beta.ppf(alpha, np.maximum(successes, 1), n - successes + 1), 0.0)
-    high = np.where(successes < n, stats.beta.isf(alpha, successes + 1, np.maximum(n - successes, 1)), 1.0)
+    low = np.where(successes > 0, special.betaincinv(np.maximum(successes, 1), n - successes + 1, alpha), 0.0)
+    high = np.where(successes < n, special.betainccinv(successes + 1, np.maximum(n - successes, 1), alpha), 1.0)
     return low, high
+
+
+def at_least(k: ArrayLike, n: ArrayLike, p: float = 0.5) -> Array:
+    """Return the probability of k or more successes in n trials, each with probability p."""
+    return np.where(np.less_equal(k, 0), 1.0, _binomial()[1](np.maximum(k, 1) - 1, n, p))
 
 
 def mean_time(events: int, time: float, dispersion: float = 1.0, level: float = 0.95) -> tuple[float, float | None]:
@@ -40,14 +63,14 @@ def mean_time(events: int, time: float, dispersion: float = 1.0, level: float = 
     A `dispersion` above 1 (variance over mean of their number per run) therefore divides their number and the time.
     The upper limit is None without any event.
     """
-    from scipy import stats
+    from scipy import special
 
     clusters = max(dispersion, 1.0)
     if events:  # at least one cluster
         clusters = min(clusters, float(events))
     n, time, tail = events / clusters, time / clusters, (1.0 - level) / 2.0
-    low = time / float(0.5 * stats.chi2.ppf(1.0 - tail, 2.0 * n + 2.0))
-    return low, time / float(0.5 * stats.chi2.ppf(tail, 2.0 * n)) if n else None
+    low = time / float(special.gammaincinv(n + 1.0, 1.0 - tail))
+    return low, time / float(special.gammaincinv(n, tail)) if n else None
 
 
 def median_limits(values: Array, level: float = 0.95) -> tuple[float, float] | None:
@@ -72,7 +95,7 @@ def paired_difference(a: Array, b: Array, level: float = 0.95, resamples: int = 
     `share` says that a and b are 0 or 1. The interval then allows for differences of -1 and 1 that happened not to occur.
     Without this, equal differences would give a bootstrap without width.
     """
-    from scipy import stats
+    from scipy import special
 
     delta = np.atleast_2d(np.asarray(a, np.float64) - np.asarray(b, np.float64))
     runs, episodes = delta.shape
@@ -82,7 +105,7 @@ def paired_difference(a: Array, b: Array, level: float = 0.95, resamples: int = 
     low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
     spread = 0.0
     if runs > 1:
-        spread = float(stats.t.ppf((1 + level) / 2, runs - 1) * delta.mean(axis=1).std(ddof=1) / np.sqrt(runs))
+        spread = float(special.stdtrit(runs - 1, (1 + level) / 2) * delta.mean(axis=1).std(ddof=1) / np.sqrt(runs))
     unseen = 1.0 - ((1.0 - level) / 2.0) ** (1.0 / episodes) if share else 0.0  # the largest probability of an event that never occurred
     below, above = max(value - low, unseen * (value + 1.0)), max(high - value, unseen * (1.0 - value))
     return Interval(value, value - float(np.hypot(below, spread)), value + float(np.hypot(above, spread)))

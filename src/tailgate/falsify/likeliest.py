@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from tailgate.core import Array
 
@@ -77,7 +77,7 @@ def likeliest(
         episodes += count + more
     at = min(range(STARTS), key=lambda i: (not failed[i], float(np.linalg.norm(found[i]))))
     distance = float(np.linalg.norm(found[at]))
-    return Likeliest(failed[at], found[at], distance, -0.5 * distance**2, float(norm.sf(distance)), episodes)
+    return Likeliest(failed[at], found[at], distance, -0.5 * distance**2, float(ndtr(-distance)), episodes)
 
 
 def _polished(play: Noisy, mean: Array, blocks: int) -> tuple[Array | None, int]:

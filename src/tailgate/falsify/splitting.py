@@ -12,8 +12,7 @@ from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from scipy.stats import norm
-from scipy.stats import t as student
+from scipy.special import ndtri, stdtrit
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
@@ -133,7 +132,7 @@ def chance_of(runs: list[Run], particles: int, confidence: float = 0.95) -> Chan
     """
     values = np.array([run.probability for run in runs])
     mean, count = float(values.mean()), len(values)
-    quantile = float(student.ppf(0.5 + 0.5 * confidence, count - 1))
+    quantile = float(stdtrit(count - 1, 0.5 + 0.5 * confidence))
     if not values.all():
         _, low, high = interval(sum(run.first for run in runs), particles * count, confidence)
     else:
@@ -150,5 +149,5 @@ def plain_episodes(chance: Chance, confidence: float = 0.95) -> float:
     half = 0.5 * (chance.high - chance.low)
     if not 0.0 < chance.probability < 1.0 or half <= 0.0:
         return math.inf
-    quantile = float(norm.ppf(0.5 + 0.5 * confidence))
+    quantile = float(ndtri(0.5 + 0.5 * confidence))
     return chance.probability * (1.0 - chance.probability) * (quantile / half) ** 2

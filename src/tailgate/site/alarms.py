@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tailgate.board.schema import Alarms, Data
 from tailgate.board.words import percent
-from tailgate.evaluation.stats import mean_time
+from tailgate.evaluation.stats import at_least, mean_time
 
 from .suite import Suite
 
@@ -73,10 +73,8 @@ def drifts_of(suite: Suite, defence: str) -> list[str]:
 
 def _aside(line: Alarms, level: float) -> str:
     """Return a flag for alarms in one half of the drive. It counts drives, which are independent: onsets come in clusters."""
-    from scipy import stats
-
     drives, most = line.early + line.late, max(line.early, line.late)
-    if not drives or stats.binomtest(most, drives, APART, alternative="greater").pvalue > level / 2.0:
+    if not drives or at_least(most, drives, APART) > level / 2.0:
         return ""
     half = "first" if line.early > line.late else "second"
     return f"its false alarms on {line.scenario} come in the {half} half of the drive, in {most} of {drives} drives with more in one half"

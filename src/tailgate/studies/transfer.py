@@ -36,14 +36,14 @@ def difference(a: Array, b: Array, share: bool = False) -> Interval:
 
     Episodes are paired, training seeds are not: their part is Welch's t over the runs' means, and missing where each side has one.
     """
-    from scipy import stats
+    from scipy import special
 
     paired = paired_difference(a.mean(axis=0), b.mean(axis=0), LEVEL, share=share)
     parts = [(float(x.mean(axis=1).var(ddof=1)) / len(x), len(x) - 1) for x in (a, b) if len(x) > 1]
     variance, spread = sum(v for v, _ in parts), 0.0
     if variance > 0.0:
         freedom = variance**2 / sum(v**2 / n for v, n in parts)
-        spread = float(stats.t.ppf((1 + LEVEL) / 2, freedom)) * variance**0.5
+        spread = float(special.stdtrit(freedom, (1 + LEVEL) / 2)) * variance**0.5
     low, high = paired.value - paired.low, paired.high - paired.value
     return Interval(paired.value, paired.value - float(np.hypot(low, spread)), paired.value + float(np.hypot(high, spread)))
 

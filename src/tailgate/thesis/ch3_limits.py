@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from tailgate.core import Array
 from tailgate.core.scenario import load_scenario
@@ -57,7 +57,7 @@ def _latency(seeds: int) -> tuple[Claim, Table, Drawing]:
         clean = play(SCENARIO, defence, "none", seeds)
         muted = float((~clean.probe[:, :, 0]).mean())
         off = np.sqrt(np.mean((clean.gap - never.gap)[:, :, 0] ** 2, axis=0))
-        inside.append(abs(mean - expected) <= norm.isf(0.025 / len(CHANCES)) * error)
+        inside.append(abs(mean - expected) <= -ndtri(0.025 / len(CHANCES)) * error)
         found[f"p = {p:g}"] = {"measured": round(mean, 2), "expected": round(expected, 2), "(1-p)/p": round((1.0 - p) / p, 2)}
         rows.append((f"{p:g}", f"{expected:.1f}", f"{mean:.1f} +- {half:.1f}", f"{100 * muted:.1f} %", str(Spread.of(off))))
         for name, value in (("p", p), ("mean", mean), ("low", mean - half), ("high", mean + half)):
