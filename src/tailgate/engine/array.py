@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tailgate.engine.buffers import blended, boxed, swept, wide
+from tailgate.engine.buffers import blended, boxed, common_shape, swept, wide
 from tailgate.engine.graph import Graph, Node
 from tailgate.engine.operations import BOOL, Array, ArrayLike, Axis, DTypeLike
 from tailgate.engine.untraceable import Untraceable
@@ -276,7 +276,7 @@ def _operators() -> None:
 
 def each(graph: Graph, function: Callable[..., Node], *arrays: Array) -> Array:
     """Apply a function of nodes at each index of the broadcast arrays."""
-    shape = np.broadcast_shapes(*(a.shape for a in arrays))
+    shape = common_shape(*arrays)
     if wide(graph, *arrays):
         return swept(graph, function, shape, arrays)
     out = np.empty(shape, object)

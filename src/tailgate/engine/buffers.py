@@ -7,6 +7,7 @@ Code that needs a single number reads it there.
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -22,8 +23,14 @@ _inside: list[Graph] = []  # graphs that trace the body of a sweep, in which no 
 
 def wide(graph: Graph, *arrays: Array, size: int = 0) -> bool:
     """Return True if an elementwise function of these arrays, or an array of `size` made from them, becomes a buffer."""
-    made = int(np.prod(np.broadcast_shapes(*(a.shape for a in arrays)), dtype=int))
+    made = math.prod(common_shape(*arrays))
     return max(size, made) >= WIDE and graph not in _inside and not all(_fixed(a) for a in arrays)
+
+
+def common_shape(*arrays: Array) -> tuple[int, ...]:
+    """Return the shape that arrays broadcast to; tracing asks for it often, and most arrays are alike."""
+    first = arrays[0].shape if arrays else ()
+    return first if all(a.shape == first for a in arrays) else np.broadcast_shapes(*(a.shape for a in arrays))
 
 
 def _fixed(nodes: Array) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import operator
 import sys
 import threading
@@ -267,6 +268,12 @@ def _makers(graph: Graph) -> dict[str, Callable[..., Any]]:
 _CONVERT = ("asarray", "ascontiguousarray", "asanyarray", "array")
 
 
+@functools.cache
+def _plain(module: str) -> bool:
+    """Return True for a module whose constructors make plain arrays."""
+    return module.split(".")[0] in _LIBRARIES or module.startswith("tailgate.engine.")
+
+
 def tracing() -> bool:
     """Return True if this thread is tracing."""
     return getattr(_here, "graph", None) is not None
@@ -280,8 +287,7 @@ def makers(graph: Graph) -> Iterator[None]:
         def maker(*args: Any, **options: Any) -> Any:
             if getattr(_here, "graph", None) is not graph:
                 return original(*args, **options)
-            caller = str(sys._getframe(1).f_globals.get("__name__", ""))
-            if caller.split(".")[0] in _LIBRARIES or caller.startswith("tailgate.engine."):
+            if _plain(sys._getframe(1).f_globals.get("__name__", "")):
                 return original(*args, **options)
             if converts and not any(isinstance(part, Traced) for part in _inside(args[:1])):
                 return original(*args, **options)

@@ -124,8 +124,9 @@ class Graph:
 
     def uniform(self, name: Hashable, value: ArrayLike) -> Node:
         """Return a number that all episodes share and that may change between calls: the code does not contain its value."""
-        node = self._node("uniform", np.asarray(value).dtype, (), name, name, True)
-        self._values[node.id] = np.asarray(value)[()]
+        held = value if isinstance(value, np.generic) else np.asarray(value)[()]
+        node = self._node("uniform", held.dtype, (), name, name, True)
+        self._values[node.id] = held
         return node
 
     def _node(self, op: str, dtype: np.dtype[Any], args: tuple[Node, ...], attr: object, key: Hashable, fixed: bool, size: int = 0) -> Node:
@@ -253,11 +254,11 @@ class Graph:
     def picks(self, buffer: Node) -> Array:
         """Return the numbers of a buffer, by place."""
         if buffer.id not in self._picks:
-            out = np.empty(buffer.size, object)
-            for i in range(buffer.size):
-                out[i] = node = Node(len(self.nodes), "pick", buffer.dtype, (buffer,), i, buffer.fixed)
-                self.nodes.append(node)
-            self._picks[buffer.id] = out
+            first, args = len(self.nodes), (buffer,)
+            nodes = [Node(first + i, "pick", buffer.dtype, args, i, buffer.fixed) for i in range(buffer.size)]
+            self.nodes += nodes
+            self._picks[buffer.id] = out = np.empty(buffer.size, object)
+            out[:] = nodes
         return self._picks[buffer.id]
 
     def held(self, name: Hashable, size: int, dtype: np.dtype[Any]) -> Node:

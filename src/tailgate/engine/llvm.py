@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from tailgate.engine import blocks, sweeps
+from tailgate.engine.collection import uncollected
 from tailgate.engine.graph import Node
 from tailgate.engine.instructions import operation, scalar
 from tailgate.engine.layout import Column, Held, Layout, Writer, last_read
@@ -243,6 +244,7 @@ class Emitter(Writer):
             self.to_memory(self.row(place, node.dtype), node.dtype, self.value(node), node.dtype.itemsize)
 
 
+@uncollected()
 def text_of(layout: Layout, arrays: int, lanes: int, least: int) -> tuple[str, dict[str, int], int]:
     """Return LLVM's text of `step`, its numbers of nodes and branches, and the bytes of its buffers."""
     e = Emitter(layout, lanes)

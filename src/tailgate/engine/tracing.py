@@ -11,6 +11,7 @@ import numpy as np
 from tailgate.base.pytree import leaves, map_leaves
 from tailgate.engine.array import Traced, lifted
 from tailgate.engine.buffers import WIDE, buffer_of, copied
+from tailgate.engine.collection import uncollected
 from tailgate.engine.functions import makers
 from tailgate.engine.graph import Graph, Node, ordered
 from tailgate.engine.operations import Array
@@ -49,6 +50,7 @@ class Trace:
         return replace(self, state=state, results=dict(results), large=large)
 
 
+@uncollected()
 def traced(function: Callable[[S, G], tuple[S, Mapping[str, Array]]], state: S, arguments: G) -> Trace:
     """Trace function(state, arguments) -> (state, results), with trees of example arrays (B, ...)."""
     graph = Graph()
