@@ -72,6 +72,7 @@ def test_chance_is_per_step_and_agent_and_independent(sends):
     np.testing.assert_array_equal(every | ~each, True)  # an agent is hit on all of its wires
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("attack", ["fdi", "fdi_gaussian", "dos_jam", "fdi_ramp", "fdi_uniform"])
 def test_chance_thins_an_attack_and_changes_nothing_else(attack, sends):
     """What is sent to those that are hit is what is sent with chance 1, which is the attack without `chance`; 0 sends nothing."""

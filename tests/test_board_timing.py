@@ -130,6 +130,7 @@ def test_a_cell_that_says_something_else_is_not_believed(board: Data) -> None:
         measure_timing(board, QUICK, episodes=1)
 
 
+@pytest.mark.long
 def test_an_attacker_that_cannot_be_played_costs_its_own_figures_alone(board: Data) -> None:
     """A file that is no policy, or one of another kind of system."""
     strange = {"rkf": "results/quick-v0/run.json", "cusum_kf": "results/transfer-v0/nothing.json", "mewma_kf": str(next(Path("src/tailgate/agents/policies").glob("platoon-dkf-0.json")))}

@@ -176,6 +176,7 @@ def test_a_score_that_does_not_move(defence, roads):
         calibrate(defence, 0.01, scenarios=roads, onsets=5)
 
 
+@pytest.mark.long
 def test_a_score_that_jumps_gets_the_threshold_that_alarms_more_rarely():
     """A leader that uses all the acceleration it may puts a safe set's reading on its very edge, once in each run, whatever the threshold below."""
     found = calibrate("safe_state", 0.1, scenarios=["stop-and-go-v0"], onsets=100, most_steps=120_000)
@@ -184,6 +185,7 @@ def test_a_score_that_jumps_gets_the_threshold_that_alarms_more_rarely():
     assert bench.run(found.threshold - 2e-7, 2.0, "calibrate", "").onsets == sum(map(len, bench.seeds(2.0)))
 
 
+@pytest.mark.long
 def test_a_climb_in_each_of_very_many_runs_is_not_taken_for_a_score_that_stands_still(monkeypatch):
     """Only the highest climbs are kept, and those of a safe set are then all alike."""
     monkeypatch.setattr(Crossings, "__init__", lambda self, keep, begin=Crossings.__init__: begin(self, 100))

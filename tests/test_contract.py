@@ -229,7 +229,7 @@ def test_a_restarted_row_plays_on_as_a_fresh_one(defence, short, loop_of):
         np.testing.assert_array_equal(ours.wires[3], fresh.wires[0])
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(6)
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_a_white_box_may_look_ahead_at_will(defence, short, loop_of):
     """Playing with the defence's state that a view shows changes nothing of the episode."""

@@ -56,7 +56,7 @@ def slow(defence):
 each = pytest.mark.parametrize("defence, place", [(d, p) for p in PLACES for d in DEFENCES])
 
 
-@pytest.mark.thin(6)
+@pytest.mark.thin(9)
 @each
 def test_a_defence_runs_and_its_rows_do_not_depend_on_their_batch(defence, place):
     """Finite arrays of the declared shapes, and the same trace_hash in batches of 1, 3 and 16, while readings are falsified and lost."""
@@ -105,7 +105,7 @@ def test_a_restarted_row_is_a_fresh_one(defence, place, same_tree):
         np.testing.assert_array_equal(ours.wires[1], theirs.wires[0])
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(6)
 @each
 def test_a_white_box_looks_at_will_and_writes_nothing(defence, place):
     """Playing ahead with the defence's state, then scribbling over all that a view shows, changes nothing of the episode."""

@@ -323,6 +323,7 @@ def test_limits_reach_the_estimate_and_the_mode_lives_on():
         plain.prepare(loop.model).mitigation_plan, 2)), received, state.known_u, None)[1].limits is None  # fmt: skip
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("mitigation", [InputClip(), SlidingMode(when="always"), SlidingMode(linger=1.0), AccFallback()])
 def test_rows_do_not_depend_on_their_batch(mitigation):
     """trace_hash of each seed is the same alone and among others, with lost and falsified readings."""

@@ -138,9 +138,9 @@ def test_projected_gradient_recovers_state_and_support():
 
 
 def test_the_error_falls_at_every_trigger():
-    """f after each projection is not above f after the one before: four windows, looked at after every gradient step."""
+    """f after each projection is not above f after the one before: two windows, looked at after every gradient step."""
     triggers = 0
-    for _ in range(4):
+    for _ in range(2):
         O, _, Y, _ = _window(1, 4, 10.0)
         energies, projections = [], []
         for rounds in range(1, 121):
@@ -149,7 +149,7 @@ def test_the_error_falls_at_every_trigger():
             projections.append(found.projections[0, 0])
         assert (np.diff(energies) <= 0.0).all() and (np.diff(projections) <= 1).all()
         triggers += projections[-1]
-    assert triggers > 20
+    assert triggers > 10
 
 
 def test_without_attacked_sensors_etpg_is_least_squares_on_the_window(linear_model):
@@ -224,6 +224,7 @@ def test_feasible_is_what_a_grid_finds():
         assert (x is not None) == (low <= high) and (x is None or low - 1e-9 <= x[0] <= high + 1e-9)
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("centre", ["least_squares", "chebyshev"])
 def test_honest_errors_within_their_bounds_never_alarm_and_move_the_estimate_by_less_than_the_bound(centre):
     """1000 draws for least squares, 100 for the linear program: nobody is blamed, and |error| <= l0_bound."""

@@ -217,6 +217,7 @@ def test_an_honest_detection_board_comes_out_equal(board: Data) -> None:
     assert len(set(drawn)) == 2
 
 
+@pytest.mark.long
 def test_an_altered_figure_is_found(board: Data, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """By its name, through the command; one that was taken out as well."""
     lines = [line for line in board["detection"]["entries"] if line["defence"] == "chi2_kf"]

@@ -67,6 +67,7 @@ def test_the_smoother_is_nearer_to_the_truth_than_the_filter():
     assert out[0]["gap_error"] == pytest.approx(filtered.std(), rel=0.35)
 
 
+@pytest.mark.long
 def test_false_alarms_are_counted():
     """Of a chi-square test at the level that one in 50 readings exceeds, on noise as it is told."""
     recording, _ = _recording(seconds=1200.0)
@@ -124,6 +125,7 @@ def test_the_command(tmp_path, capsys):
     assert "open loop; errors against a smoother" in capsys.readouterr().out
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("form, start", [("svg", b"<?xml"), ("pdf", b"%PDF")])
 def test_the_picture_is_a_vector_where_its_name_ends_so(form, start, tmp_path):
     """And the same bytes each time."""

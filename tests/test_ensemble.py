@@ -80,7 +80,7 @@ def assert_same(place, found, wanted, text):
 def test_a_row_plays_what_its_text_says(name):
     """For every family of scripts."""
     place, rng = arena(name), np.random.default_rng(7)
-    space, count, attacked = place.space, 3 * len(place.space.families), 0
+    space, count, attacked = place.space, 2 * len(place.space.families), 0
     genomes = rng.random((count, len(GENES)))
     genomes[:, 0] = (np.arange(count) % len(space.families) + 0.5) / len(space.families)
     outcome = played(place, space.scripts(genomes))

@@ -114,7 +114,7 @@ FACE_NAMES = ("single", "sb3", *AUTORESETS)
 PLAYED = [(name, engine) for name in SYSTEMS for engine in ("auto", "plain") if (name, engine) != (HIGHWAY, "plain")]
 
 
-@pytest.mark.thin(10)
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("face", FACE_NAMES)
 @pytest.mark.parametrize("name, engine", PLAYED)
 def test_nothing_that_was_handed_out_is_used_again(name, engine, face, tiny):
@@ -265,6 +265,7 @@ def test_the_game_is_shown_in_a_window(monkeypatch):
 # -- pictures
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("autoreset", AUTORESETS)
 @pytest.mark.thin(4)
 def test_pictures_of_the_fast_engine_are_those_of_the_plain_loop(autoreset, brief):

@@ -62,6 +62,7 @@ def test_a_run_is_no_longer_than_asked_and_batches_change_no_figure(monkeypatch)
     assert false_alarms(ROAD, [told], 20, 10 * horizon) == whole
 
 
+@pytest.mark.long
 def test_a_constant_gain_alarms_while_it_settles():
     """Steady filters of a network that starts from a guess; the time-varying one has no such half."""
     suite = dataclasses.replace(load_suite("network-v0"), scenarios=("network-restless-v0",))

@@ -192,7 +192,7 @@ def _all_die(job: str, folder: Path, every: int = 1) -> int:
     return last
 
 
-@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.long), 9])
+@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.long), 15])
 def test_a_board_that_is_killed_at_any_step_is_made_whole_by_the_same_command(tmp_path: Path, every: int) -> None:
     """Packed rows, board.json and run.json: dead at a call of the hook, nothing broken lies there, and a rerun gives the same rows and board."""
     (tmp_path / dying.NAME).write_text(dying.FILE)
@@ -242,6 +242,7 @@ def test_a_process_that_dies_at_any_step_leaves_nothing_broken(tmp_path: Path, e
     assert left >= 6 // every  # of two cells and the output, killed before the fsync and before the rename
 
 
+@pytest.mark.long
 def test_a_run_that_is_killed_at_a_random_time_goes_on(tmp_path: Path) -> None:
     """SIGKILL at some time after the first cell: the smoke test of the command. Its two workers end with it, and the rerun is whole."""
     defences, attacks, out = ("kf", "chi2_kf"), ("none", "fdi:value=5", "dos_hold"), tmp_path / "rows.jsonl"

@@ -84,6 +84,7 @@ def known(text: str) -> dict[str, Any]:
     return {key: json.loads(value) for key, value in values.items() if not value.endswith("...")}
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize(("command", "folder", "preset"), [("train", "", "quickstart"), ("selfplay", "games", "selfplay")])
 def test_help_lists_every_nested_key_with_its_default(command: str, folder: str, preset: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """And what the preset of the bare command sets in its place."""

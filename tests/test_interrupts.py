@@ -77,7 +77,7 @@ def _command(code: str) -> subprocess.Popen[str]:
 IGNORED = "class A:\n        def __del__(self): time.sleep(30)\n    a = A(); del a; time.sleep(30)"
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(6)
 @pytest.mark.parametrize(
     ("code", "signals", "status", "word"),
     [

@@ -58,7 +58,7 @@ def test_an_interrupted_search_goes_on(job: standard.Job, tmp_path: Path, monkey
     assert not list(tmp_path.glob("*/searches/*.journal"))
 
 
-@pytest.mark.thin(4)
+@pytest.mark.thin(8)
 @pytest.mark.parametrize("damage", ["", "[]", '{"members": 3}', "attack: evil:Attack", "attack: nosuch:x=1", "member: x0", "damage: 2.0", "score: null"])
 def test_a_damaged_journal_begins_again(job: standard.Job, damage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """So does one whose files are gone, or that names code."""

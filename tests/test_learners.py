@@ -91,6 +91,7 @@ def test_it_learns_when_to_attack(name: str, decisions: int, paid: dict[str, Any
     assert [entry["steps"] for entry in run.curve] == sorted({entry["steps"] for entry in run.curve}) and len(run.curve) > 3
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize(("name", "least"), [("sac", 1.0), ("tqc", 0.35)])
 def test_it_learns_what_to_inject(name: str, least: float, paid: dict[str, Any], tmp_path: Path) -> None:

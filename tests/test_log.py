@@ -155,6 +155,7 @@ def test_no_seed_is_one_of_a_board() -> None:
         assert not any(keys[purpose] & keys[other] for other in draws.PURPOSES if other != purpose)
 
 
+@pytest.mark.long
 def test_the_same_log_has_the_same_bytes(made: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twice, and with fewer rows in a row group the same table; a whole log is not played again, another one is not overwritten."""
     out, held = made

@@ -187,6 +187,7 @@ class Halting(Composed):
         return KalmanFilter(), ChiSquare(30.0), Halts()
 
 
+@pytest.mark.long
 def test_who_stands_still_under_attack_is_damaged_from_v1_on() -> None:
     """A car that stops behind a leader who drives on would be as good as one that follows."""
     given = Suite("s", "", ("stop-and-go-v0",), (12,), ("halting", "none"), ("none", "fdi:start_step=100,value=-40"), 6, shown={12: "a"})
@@ -263,6 +264,7 @@ def test_sentinels_take_no_rank_and_the_reason_names_their_gate(small: tuple[Sui
     assert hurt["kf"]["collisions"] > 0 and hurt["kf"]["mean"] > 0.0 and hurt["kf"]["mean"] <= hurt["kf"]["most"]
 
 
+@pytest.mark.long
 def test_a_board_is_checked_from_its_cells_alone(small: tuple[Suite, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     """Lost progress needs clean runs that a sample of cells may not hold."""
     given, folder = small
@@ -355,6 +357,7 @@ def test_evaluate_and_a_score_make_the_board_of_a_suite_v1(tmp_path: Path, capsy
     assert Path(capsys.readouterr().out.strip()).is_file()
 
 
+@pytest.mark.long
 def test_a_network_has_the_pointwise_worst_alone() -> None:
     given = replace(load_suite("network-v1"), defences=("kf", "dkf"), attacks=("none", "fdi:value=100"), doses=(5,), shown={5: "a"}, seeds=4, scenarios=("network-restless-v0",))
     made = board(evaluate(given), given)

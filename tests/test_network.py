@@ -217,6 +217,7 @@ def test_noise_has_the_stated_variance_and_is_told_apart():
     assert abs(np.corrcoef(w[1:].ravel(), w[:-1].ravel())[0, 1]) < 5 / np.sqrt(w.size)
 
 
+@pytest.mark.long
 def test_weak_sensing_needs_the_neighbours():
     """In network-weak-v0 no agent can know the state alone, all can together; a Kalman filter alone fails, a distributed one does not."""
     place = load_scenario("network-weak-v0")
@@ -301,6 +302,7 @@ def test_published_networks(name):
     assert error[place.threat_model.onset :].max() < 0.6 * unknown.max()
 
 
+@pytest.mark.long
 def test_the_alarm_of_a_group_is_on_while_any_agent_alarms():
     """Calibration counts onsets as the metric does, in hours of the system; how many episodes run side by side changes nothing."""
     place = dataclasses.replace(load_scenario("network-noisy-v0"), horizon=60)

@@ -107,6 +107,7 @@ def test_rows_are_steered_on_their_own():
     assert len({float(score) for score in whole[1][:, -2]}) == 3  # where the threshold stands
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("interval", [1, 7, 20])
 @pytest.mark.thin(4)
 def test_masks_agree_with_what_the_channel_accepts(interval):

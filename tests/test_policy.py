@@ -271,6 +271,7 @@ def test_an_error_names_some_of_many_observations(tmp_path: Path) -> None:
     assert len(str(caught.value)) < 300
 
 
+@pytest.mark.long
 def test_a_timing_advantage_counts_any_metric(tmp_path: Path) -> None:
     """The outcome is a metric's; where nothing collides it is an error."""
     path = _policy(tmp_path, {"action": "mode"}, scenario="thesis-ch5-v0")

@@ -47,7 +47,7 @@ def test_the_pull_off_grows_by_its_rate_up_to_the_bound():
 
 
 @pytest.mark.parametrize("attack", ["noise_jam", "echo_delay", "echo_pull_off", "radar_jam"])
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 def test_who_hops_radiates_only_after_a_step_with_a_probe(attack):
     """hop=true: silent in every step that follows a muted one, as the plain script is not; nothing is refused."""
     for text, silent in ((f"{attack}:start_step=5,hop=true", True), (f"{attack}:start_step=5", False)):

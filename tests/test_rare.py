@@ -66,6 +66,7 @@ def test_a_rare_event_of_a_linear_system_has_its_probability():
         assert (one.margins < 0.0).all()  # the paths that are returned arrive, when played again
 
 
+@pytest.mark.long
 def test_a_frequent_event_is_counted_as_plain_episodes_count_it():
     """A level that a fifth of the paths reach: the mean of many small runs is the share of many paths."""
 

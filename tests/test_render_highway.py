@@ -263,6 +263,7 @@ def test_after_a_reset_nothing_is_believed_yet(said):
     assert "new episode; the last one ended in a COLLISION" in said
 
 
+@pytest.mark.long
 def test_long_platoons_show_the_watched_car():
     """Of twenty cars those around the one that may be attacked, no smaller than can be seen."""
     place = load_scenario("platoon-braking-v0")

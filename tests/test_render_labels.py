@@ -1,5 +1,7 @@
 """Nothing written in a picture on the road covers another word, a mark or a car: measured on the letters that are drawn."""
 
+import functools
+
 import gymnasium
 import numpy as np
 import pytest
@@ -62,6 +64,7 @@ def witness(monkeypatch):
     return pens
 
 
+@functools.cache
 def episode(name):
     """(loop, state, frame) at some steps of an episode that is attacked from early on, right after its reset and at its end among them."""
     face, action, arguments = SCENES[name]
@@ -80,11 +83,6 @@ def episode(name):
     return [shots[i] for i in sorted(chosen)]
 
 
-@pytest.fixture(scope="module")
-def episodes():
-    return {name: episode(name) for name in SCENES}
-
-
 def seats(stage, sheet):
     """The boxes of the cars that are seen."""
     return [(car, sheet.seat(car)) for car in stage.cars if -20 < sheet.column(car.x) < sheet.width + 20]
@@ -93,9 +91,9 @@ def seats(stage, sheet):
 @pytest.mark.thin(60)
 @pytest.mark.parametrize("size", SIZES, ids=str)
 @pytest.mark.parametrize("name", SCENES)
-def test_no_word_covers_another_or_a_car(name, size, episodes, witness):
+def test_no_word_covers_another_or_a_car(name, size, witness):
     """Of all letters in the picture, bars and all, and of the marks; what counts most is never left out."""
-    for loop, state, frame in episodes[name]:
+    for loop, state, frame in episode(name):
         render_highway.draw(loop, state, frame, 0, size, "who plays: a line of some length that says so")
         words = witness[-1].words
         for i, (one, box) in enumerate(words):

@@ -124,6 +124,7 @@ def load_road():
     return play(run_cell(Cell("s", "stop-and-go-v0", None, "none", "none", 1))[0])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scenario", ["radar-following-v0", "radar-braking-v0", "radar-fast-attacker-v0"])
 def test_published_scenarios_play_again(scenario):
     """Bit for bit from the row."""

@@ -127,6 +127,7 @@ def test_where_half_are_detected():
     assert ch3_limits._half(reaction, np.array([0.9, 1.0, 1.0])) == 1e-4 and ch3_limits._half(reaction, np.zeros(3)) == 1e-2
 
 
+@pytest.mark.long
 def test_the_pictures(runs):
     """Figures 3.2a to 3.3b and three more, each a picture of some size whose caption says which run it shows."""
     latency = {"p": np.array([0.1, 0.5]), "mean": np.array([9.0, 1.0]), "low": np.array([8.0, 0.9]), "high": np.array([10.0, 1.1])}

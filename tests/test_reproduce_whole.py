@@ -67,6 +67,7 @@ def test_chapter_7(chapter_7):
     assert moves[0] < moves[1] < moves[2]
 
 
+@pytest.mark.long
 def test_a_threat_that_never_came_about_is_not_answered(chapter_7):
     """A property that held because its antecedent did not is no measurement."""
     told = chapter_7["7.4-600-threat"].measured

@@ -65,6 +65,7 @@ def test_a_run_says_what_it_took(suite: Path, tmp_path: Path, capsys: pytest.Cap
     assert (folder / "board.json").read_bytes() == board
 
 
+@pytest.mark.long
 def test_interrupted_runs_add_up(suite: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each command counts what it played itself; what lay there before any record is kept."""
     monkeypatch.setattr(run_record, "EVERY", 0.0)
@@ -119,6 +120,7 @@ def _record(suite: str, identity: str, count: int = 1) -> dict[str, Any]:
     return {"format": "tailgate-run-1", "suite": suite, "hash": identity, **sums, "commands": commands}
 
 
+@pytest.mark.long
 def test_a_page_says_what_playing_its_board_took(tmp_path: Path) -> None:
     """In a sentence, of the record beside the board; one of another suite, or another version of it, is left out."""
     once, twice = (Run.model_validate(_record("mine", "0" * 16, count)) for count in (1, 2))

@@ -74,6 +74,7 @@ def test_an_erratum_takes_back_and_stays(tmp_path) -> None:
         append(path, dataclasses.replace(LINE, date="yesterday"))
 
 
+@pytest.mark.long
 def test_a_list_that_was_published_holds_wherever_a_folder_has_none(tmp_path) -> None:
     """For a board, a submission and trust alike; a folder's list goes on from it. A suite that was changed under its name has none."""
     suite, own = load_suite("quick-v0"), tmp_path / "attacks.jsonl"

@@ -165,6 +165,7 @@ def test_an_agent_alone_is_lost_in_the_weak_network_whatever_its_filter() -> Non
     assert all(error < suite.bound for (defence, _), error in errors.items() if defence == "dkf")
 
 
+@pytest.mark.long
 def test_detectors_that_are_off_where_sensors_are_noisier_than_told_fail_a_gate_of_a_platoon() -> None:
     """Those that are left out of its board, and `chi2_kf`, which is on it, does not."""
     noisy = {"scenarios": ("platoon-noisy-v0",), "robustness": ("platoon-noisy-v0",), "attacks": ("none",), "doses": (60,), "shown": {60: "6 s"}, "adaptive": {}}

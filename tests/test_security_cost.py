@@ -97,6 +97,7 @@ def test_a_unit_of_its_own_is_not_in_the_way(tmp_path):
     assert held.responses == {"one": 1, "two": 2, "three": 3} and set(held.load) == {"one", "two", "three"}
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize(("metric", "delay"), [("min_gap", 0.0), ("min_gap", 0.4), ("min_gap", 0.8), ("rmse_position", 0.0)])
 def test_a_longer_period_never_lowers_the_cost_of_car_following_at_the_same_delay(tmp_path, delay, metric):
     """Not so of errors of late readings, nor of a platoon: docs/security-cost.md."""

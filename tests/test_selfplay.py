@@ -173,6 +173,7 @@ def test_a_run_from_the_command_line(tiny):
     assert code == cli.EXIT_INPUT and "gamma" in said.err
 
 
+@pytest.mark.long
 def test_the_worst_attack_is_chosen_on_select_seeds(tiny):
     """Replayed one by one, no attack does more there than the one that is named, against the trained defender and the fixed setting."""
     home, out, _ = tiny
@@ -189,6 +190,7 @@ def test_the_worst_attack_is_chosen_on_select_seeds(tiny):
     assert max(most) > 0
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize(
     "select, report, worst, weak",
     [  # collisions in 8 episodes of: none, the script, self-play's last attacker, fresh against trained, fresh against fixed

@@ -96,6 +96,7 @@ def test_holm_rejects_step_by_step() -> None:
     assert holm([0.6, 0.7]) == [1.0, 1.0]
 
 
+@pytest.mark.long
 def test_the_median_lies_within_its_limits_as_often_as_they_say() -> None:
     """Ranks 40 and 61 of 100 (Conover); five values cannot cover; of a skewed distribution 95 % or more of the intervals hold its median."""
     values = np.random.default_rng(0).permutation(np.arange(1.0, 101.0))

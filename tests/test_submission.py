@@ -88,6 +88,7 @@ class Muting(Kalman):
 """
 
 
+@pytest.mark.long
 def test_draws_of_a_submission_are_those_of_the_defence_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A radar that mutes itself at random: its process has the keys of its own party, so its rows are the same."""
     (tmp_path / "muting_sub.py").write_text(MUTING, encoding="utf-8")
@@ -102,6 +103,7 @@ def test_draws_of_a_submission_are_those_of_the_defence_alone(tmp_path: Path, mo
     sys.modules.pop("muting_sub", None)
 
 
+@pytest.mark.long
 def test_other_companions_and_another_order_change_nothing(places: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Rows in batches of one row for each cell, and in other secret orders, are those of one batch; so the companions test is passed."""
     cells = [Cell("s", places[1], 30, KALMAN, attack, 2) for attack in ("none", "fdi:start_step=10,value=20")]
@@ -138,6 +140,7 @@ def test_an_interrupted_run_resumes_after_the_scenarios_that_it_finished(
     assert _results(rows) == _results(_alone(suite, KALMAN))
 
 
+@pytest.mark.long
 def test_two_workers_give_the_rows_of_one_on_the_seeds_of_a_beacon(places: tuple[str, str], tmp_path: Path) -> None:
     """Each row's seed is one of the beacon's; playing it by itself gives the same trace."""
     suite, beacon = _suite(*places, seeds=1, attacks=("none",)), "0123456789abcdef"

@@ -286,7 +286,7 @@ def test_what_ends_a_process_costs_its_scenario_and_no_other(world: Path, how: s
 @pytest.mark.parametrize(
     ("how", "reason", "limits"),
     [
-        ("loop", "processor time: ", {"silence": 60.0, "start_time": 6.0, "step_time": 1e-6}),
+        ("loop", "processor time: ", {"silence": 60.0, "start_time": 3.0, "step_time": 1e-6}),
         ("sleep", "silence: no answer for 1 s", {"silence": 1.0}),
         ("share", "memory: ", {"silence": 30.0, "memory": 2**30}),
         ("number", "InputError: defence output score: got 'Big'; expected an array", {}),

@@ -62,6 +62,7 @@ def test_a_demonstration_is_the_script_and_its_returns() -> None:
     assert not np.array_equal(other.observation[:64], shown.observation[:64])
 
 
+@pytest.mark.long
 def test_who_was_shown_a_script_does_what_it_does(tmp_path: Path) -> None:
     """Before any learning of its own the policy collides about as often as its teacher, where an untaught one does not collide at all."""
     learner = Learner(0, 0.9, SMALL, {k: v for k, v in ENVIRONMENT.items() if k != "gamma"})
@@ -95,6 +96,7 @@ def test_a_taught_run_resumes_to_the_same_policy(tmp_path: Path) -> None:
     assert train.train(untaught, lambda seed, now: None)[0].with_suffix(".safetensors").read_bytes() != straight
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("hidden", [(), (8,)])
 def test_a_search_begins_at_what_it_was_shown(tmp_path: Path, hidden: tuple[int, ...]) -> None:

@@ -182,7 +182,7 @@ def test_parameters_of_other_values_are_traced_once(monkeypatch):
     keys = draws.keys("report", range(5))
 
     def play(defence, rival, budget, method=None):
-        place = load_scenario("gusty-stop-and-go-v0").with_threat(budget=budget)
+        place = dataclasses.replace(load_scenario("gusty-stop-and-go-v0").with_threat(budget=budget), horizon=150)
         loop, attack = place.loop(Spec("defence", defence).make()), Spec("attack", rival).make()
         found, wanted = rollout_of(loop, attack), rollout(loop, attack, keys, plain=True)
         got = Trace(loop.model, loop.horizon, *found.play(keys, True), loop.controller.desired_gap)

@@ -117,7 +117,7 @@ RADARS = [
 ]
 
 
-@pytest.mark.thin(10)
+@pytest.mark.thin(20)
 @pytest.mark.parametrize(("scenario", "defence", "attack", "threat"), [(*cell, {}) for cell in CARS + STEALTH] + RADARS)
 def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack, threat):
     trace_as_plain(*loop_of(scenario, defence, attack, **threat))
@@ -161,7 +161,7 @@ ENVIRONMENTS = [
 ]  # fmt: skip
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("arguments", ENVIRONMENTS, ids=lambda a: f"{a['scenario']}-{a['defence']}")
 def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
     """Observations, rewards, flags and information, over restarts, a masked reset and what was held."""

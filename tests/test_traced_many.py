@@ -120,6 +120,7 @@ def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack, t
     assert attack == "none" or "near" in attack or (plain.kind != 0).any()
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("followers", [1, 2, 7])
 def test_strings_of_any_length(followers, tmp_path):
     """A single row, and other numbers of states; with a manoeuvre that is a table, and no noise of the sensors."""
@@ -205,7 +206,7 @@ ENVIRONMENTS = [
 ]  # fmt: skip
 
 
-@pytest.mark.thin(14)
+@pytest.mark.thin(28)
 @pytest.mark.parametrize("arguments", ENVIRONMENTS, ids=lambda a: f"{a['scenario']}-{a['defence']}")
 def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
     """Observations, rewards, flags and information, over restarts, a masked reset and what was held."""

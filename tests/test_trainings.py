@@ -38,6 +38,7 @@ def nobody(*_: object) -> None:
     pass
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("workers", [1, 2])
 def test_one_that_fails_is_named_and_cuts_nobody_short(tmp_path: Path, workers: int) -> None:
@@ -117,6 +118,7 @@ def test_processes_that_train_end_with_their_parent(tmp_path: Path) -> None:
     assert sorted(path.name for path in held.glob("checkpoint-*.safetensors")) == ["checkpoint-0.safetensors", "checkpoint-1.safetensors"]
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("gap", [0.0, 0.05])
 def test_two_interrupts_end_a_training_too(tmp_path: Path, gap: float) -> None:

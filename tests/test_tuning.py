@@ -137,6 +137,7 @@ def test_values_that_a_learner_refuses_cost_their_trial_only(tmp_path: Path) -> 
     assert tuning.tune(search) == report
 
 
+@pytest.mark.long
 def test_a_policy_that_diverges_costs_its_trial_only(tmp_path: Path) -> None:
     """A step size under which continuous actions are no longer numbers: said, not played again, and the search goes on."""
     pytest.importorskip("stable_baselines3")
