@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from tailgate.base.errors import InputError
+from tailgate.base.pytree import leaves
 from tailgate.engine.operations import Array
 from tailgate.engine.untraceable import Untraceable
 
+if TYPE_CHECKING:
+    from tailgate.engine.program import Program
+
 T = TypeVar("T")
+S = TypeVar("S")
 TRIED, ROWS = 24, 64  # steps and episodes in which new code is compared with the plain loop
 
 
@@ -54,6 +59,29 @@ def raised(play: Callable[[], T]) -> T | str:
         return play()
     except InputError as error:
         return str(error)
+
+
+def apart(program: Program, begun: S, step: Callable[[S], tuple[S, Mapping[str, Array]]], steps: int) -> str:
+    """Play some steps of a program without arguments beside the plain `step`; return the first difference, or nothing.
+
+    begun: the state of ROWS episodes. step: returns the next state and its results.
+    """
+    state = program.rows(ROWS)
+    state.put(begun)
+    call = program.call(state, 2)  # the form that plays: several steps, of which each is one
+    for number in range(1, steps + 1):
+        call.begin()
+        call.play(1)
+        results = {name: value[0] for name, value in call.results().items()}
+        found = raised(lambda: step(begun))  # noqa: B023
+        if isinstance(found, str):
+            return "" if not results["demands"].all() else f"step {number}: {found}"
+        begun, wanted = found
+        got, held = results | {name: state.get_leaf(name) for name in program.places}, leaves(begun) | dict(wanted)
+        for name in (*program.places, *wanted):
+            if not same(got[name], held[name]):
+                return f"{name}, step {number}"
+    return ""
 
 
 def same(got: Array, wanted: Array) -> bool:

@@ -10,13 +10,13 @@ from typing import Any, NamedTuple, Protocol, cast
 
 import numpy as np
 
-from tailgate.base.pytree import leaves, map_leaves
+from tailgate.base.pytree import map_leaves
 from tailgate.core import Array, Attack, Command, View
 from tailgate.core.draws import Draws, Keys
 from tailgate.core.kinds import EFFECTS, Kind
 from tailgate.core.loop import Loop
 from tailgate.core.threat import Brief
-from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
+from tailgate.engine.agreement import ROWS, TRIED, Untraced, apart, check_open
 from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, Program, State
 from tailgate.engine.remembered import Remembered
@@ -217,18 +217,5 @@ def _keys(batch: int) -> Keys:
 
 
 def _difference(made: Battery, few: object) -> str:
-    """Play some steps in both engines; return the first difference, or nothing."""
-    plain = begun(made.loop, _keys(ROWS), few)
-    state = State(made.program, ROWS)
-    state.put(plain)
-    call = Call(made.program, state)
-    for number in range(min(TRIED, made.loop.horizon)):
-        results, found = call(), raised(lambda: step(made.loop, made.attack, made.plan, plain))  # noqa: B023
-        if isinstance(found, str):
-            return "" if not results["demands"].all() else f"step {number + 1}: {found}"
-        plain = found[0]
-        held = leaves(plain)
-        for name in made.program.places:
-            if not same(state.get_leaf(name), held[name]):
-                return f"{name}, step {number + 1}"
-    return ""
+    first, steps = begun(made.loop, _keys(ROWS), few), min(TRIED, made.loop.horizon)
+    return apart(made.program, first, lambda held: step(made.loop, made.attack, made.plan, held), steps)

@@ -7,11 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tailgate.base.pytree import leaves
 from tailgate.core import Attack
 from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import Loop, LoopState
-from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
+from tailgate.engine.agreement import ROWS, TRIED, Untraced, apart, check_open
 from tailgate.engine.cards import device
 from tailgate.engine.operations import Array
 from tailgate.engine.parameters import lifted
@@ -122,25 +121,7 @@ def _sensed(loop: Loop, begun: Episodes) -> Episodes:
     return begun
 
 
-def _difference(rollout: Rollout, batch: int = ROWS) -> str:
-    """Play some steps in both engines; return the first difference, or nothing."""
+def _difference(rollout: Rollout) -> str:
     from tailgate.core import draws
 
-    plain = rollout.begun(draws.keys("tune", range(batch)))
-    state = rollout.program.rows(batch)
-    state.put(plain)
-    call = rollout.program.call(state, 2)  # the form that plays: several steps, of which each is one
-    for step in range(min(TRIED, rollout.loop.horizon)):
-        call.begin()
-        call.play(1)
-        results = {name: value[0] for name, value in call.results().items()}
-        found = raised(lambda: rollout.plain(plain))  # noqa: B023
-        if isinstance(found, str):
-            return "" if not results["demands"].all() else f"step {step + 1}: {found}"
-        plain, wanted = found
-        held = leaves(plain)
-        got = results | {name: state.get_leaf(name) for name in rollout.program.places}
-        for name in (*rollout.program.places, *wanted):
-            if not same(got[name], (held | wanted)[name]):
-                return f"{name}, step {step + 1}"
-    return ""
+    return apart(rollout.program, rollout.begun(draws.keys("tune", range(ROWS))), rollout.plain, min(TRIED, rollout.loop.horizon))
