@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tailgate.agents.learners import cem
+from tailgate.agents.learners import cem, teacher
 from tailgate.agents.learners.learning import Teachable, learner_of
 from tailgate.agents.learners.ppo import Config, Learner
 from tailgate.agents.learners.teacher import demonstrate, nearest
@@ -15,6 +15,7 @@ from tailgate.base.errors import InputError
 from tailgate.core import Kind, draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import config_path
+from tailgate.engine.tracing import traced
 from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.play.metrics import crashed
 from tailgate.play.trace import rollout
@@ -60,6 +61,20 @@ def test_a_demonstration_is_the_script_and_its_returns() -> None:
     assert demonstrate(seat, attack(SCRIPT), 0, episodes=64).action.tolist() == shown.action.tolist()
     other = demonstrate(seat, attack(SCRIPT), 1, episodes=64)
     assert not np.array_equal(other.observation[:64], shown.observation[:64])
+
+
+def test_a_long_demonstration_is_played_by_a_traced_program_with_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two frames are shown at each decision; another script of the class is traced no more."""
+    seat = Seat.make(**(ENVIRONMENT | {"interval": 1, "frames": 2}))
+    scripts = [attack(SCRIPT), attack(SCRIPT.replace("40", "50"))]
+    traces = []
+    monkeypatch.setattr(teacher, "traced", lambda *arguments: traces.append(1) or traced(*arguments))
+    found = [demonstrate(seat, script, 0, episodes=7) for script in scripts]
+    assert len(traces) == 1
+    monkeypatch.setattr(teacher, "LONG", 10**9)
+    plain = [demonstrate(seat, script, 0, episodes=7) for script in scripts]
+    assert [[part.tobytes() for part in one] for one in found] == [[part.tobytes() for part in one] for one in plain]
+    assert found[0].observation.shape[1] == 2 * len(seat.observation.columns) and not np.array_equal(found[0].action, found[1].action)
 
 
 @pytest.mark.long

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import copy
+import dataclasses
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from tailgate.agents.learners.learning import SEED_STRIDE
 from tailgate.base.errors import InputError
 from tailgate.core import Array, Attack, Command, draws
-from tailgate.core.draws import Role
+from tailgate.core.draws import Keys, Role
+from tailgate.core.loop import LoopState
+from tailgate.engine.agreement import ROWS, TRIED, apart, check_open
+from tailgate.engine.parameters import lifted
+from tailgate.engine.program import Program
+from tailgate.engine.remembered import Remembered
+from tailgate.engine.tracing import traced
 from tailgate.envs.gym.actions import ActionCodec
-from tailgate.envs.gym.attacker_mdp import Seat
+from tailgate.envs.gym.attacker_mdp import Seat, Tally
+from tailgate.envs.gym.observations import ObservationCodec
+from tailgate.play.trace import LONG, WORTH
 
 FIRST = SEED_STRIDE // 2  # number of the first demonstration among the episodes of a training seed
 
@@ -39,30 +49,92 @@ def nearest(codec: ActionCodec, command: Command) -> Array:
     return action
 
 
+class Shown(NamedTuple):
+    """The state of demonstrated episodes."""
+
+    loop: LoopState
+    tally: Tally
+    memory: Any  # of the script
+
+
+class Showing:
+    """The program of a seat's decisions that come nearest to those of a script. Raises whatever its parts raise while they are traced."""
+
+    def __init__(self, seat: Seat, attack: Attack, plan: object) -> None:
+        check_open(seat.loop)
+        self.seat, self.attack, self.plan, self.values = seat, attack, plan, None
+        self.program = Program(traced(self._traced, begun(seat, attack, plan, _ONE), None).pruned(keep=["loop.ended"]))
+        self.programs = (self.program,)
+
+    def of(self, seat: Seat, attack: Attack, plan: object, values: list[Array] | None) -> Showing:
+        """Return the same program for parameters of other values."""
+        out = copy.copy(self)
+        out.seat, out.attack, out.plan, out.values = seat, attack, plan, values  # type: ignore[assignment]
+        return out
+
+    def _traced(self, held: Shown, _: None) -> tuple[Shown, dict[str, Array]]:
+        return decided(*lifted(held.loop.k, (self.seat, self.attack, self.plan)), held)
+
+    def play(self, keys: Keys) -> dict[str, Array]:
+        """Return the results (K, B, ...) of all decisions."""
+        state = self.program.rows(len(keys.key))
+        state.put(begun(self.seat, self.attack, self.plan, keys))
+        return self.program.call(state, self.seat.decisions, self.values)()
+
+
+def begun(seat: Seat, attack: Attack, plan: Any, keys: Keys) -> Shown:
+    """Return the state of episodes that begin."""
+    state, batch = seat.loop.start(keys), len(keys.key)
+    return Shown(state, seat.begin(state), attack.start(plan, batch, keys.at(Role.ATTACK, np.zeros(batch, np.int64))))
+
+
+def decided(seat: Seat, attack: Attack, plan: Any, held: Shown) -> tuple[Shown, dict[str, Array]]:
+    """Play a decision; return the next state, and what was seen, done and gained in the rows that still play."""
+    state, memory = held.loop, held.memory
+    over, view, numbers = state.ended, seat.loop.sense(state), state.keys.at(Role.ATTACK, state.k)
+    memory, command = attack.decide(plan, memory, view, numbers)
+    for _ in range(seat.action.spec.interval - 1):  # the script's clock runs on while a decision holds
+        memory, _ = attack.decide(plan, memory, view, numbers)
+    action = nearest(seat.action, command)
+    state, tally, outcome, _ = seat.step(state, held.tally, action, over)
+    return Shown(state, tally, memory), {"seen": seat.observation.observe(view), "action": action, "reward": outcome.reward, "live": ~over}
+
+
 def demonstrate(seat: Seat, attack: Attack, seed: int, episodes: int) -> Demonstration:
     """Play what comes nearest to a script at each decision, on training episodes of a seed. Discrete actions only."""
     if not seat.action.discrete:
         raise InputError("teacher", seat.action.spec.action, "a discrete action: timing, mode or ramp")
-    loop = seat.loop
     keys = draws.keys("train", range(seed * SEED_STRIDE + FIRST, seed * SEED_STRIDE + FIRST + episodes))
-    state, plan = loop.start(keys), attack.prepare(loop.brief)
-    memory = attack.start(plan, episodes, keys.at(Role.ATTACK, np.zeros(episodes, np.int64)))
-    tally, seen = seat.begin(state), None
-    observations, actions, rewards, live = [], [], [], []
-    for _ in range(seat.decisions):
-        over, view = state.ended.copy(), loop.sense(state)
-        seen = seat.observation.observe(view, seen)
-        memory, command = attack.decide(plan, memory, view, keys.at(Role.ATTACK, state.k))
-        for _ in range(seat.action.spec.interval - 1):  # the script's clock runs on while a decision holds
-            memory, _ = attack.decide(plan, memory, view, keys.at(Role.ATTACK, state.k))
-        action = nearest(seat.action, command)
-        state, tally, outcome, _ = seat.step(state, tally, action, over)
-        observations.append(seen)
-        actions.append(action)
-        rewards.append(outcome.reward)
-        live.append(~over)
-    gained = np.array(rewards)
+    one = dataclasses.replace(seat, observation=ObservationCodec(seat.loop.brief), config={})
+    played = _played(one, attack, attack.prepare(seat.loop.brief), keys)
+    gained, live = played["reward"], played["live"]
     for k in range(len(gained) - 2, -1, -1):
         gained[k] += seat.reward.gamma * gained[k + 1]
-    played = np.array(live)
-    return Demonstration(np.array(observations)[played], np.array(actions)[played], gained[played])
+    latest = np.arange(len(gained))
+    seen = [played["seen"][np.maximum(latest - back, 0)] for back in range(seat.observation.frames)]  # the newest frame comes first
+    return Demonstration(np.concatenate(seen, axis=-1)[live], played["action"][live], gained[live])
+
+
+def _played(seat: Seat, attack: Attack, plan: object, keys: Keys) -> dict[str, Array]:
+    """Return the results (K, B, ...) of all decisions, by a traced program where it pays."""
+    if seat.action.spec.interval == 1 and (seat.loop.horizon >= LONG or seat.loop.horizon * len(keys.key) >= WORTH):
+        made = _made.proved(
+            (seat, attack, plan), lambda: decided(seat, attack, plan, begun(seat, attack, plan, _ONE)), lambda: Showing(seat, attack, plan),
+            lambda found, values: found.of(seat, attack, plan, values), _difference,
+        )  # fmt: skip
+        if isinstance(made, Showing):
+            return made.play(keys)
+    held, out = begun(seat, attack, plan, keys), []
+    for _ in range(seat.decisions):
+        held, results = decided(seat, attack, plan, held)
+        out.append(results)
+    return {name: np.array([one[name] for one in out]) for name in out[0]}
+
+
+_ONE = Keys(np.zeros((1, 3), np.uint64), np.zeros(1, np.uint32))
+_made: Remembered[Showing] = Remembered()
+
+
+def _difference(made: Showing) -> str:
+    first = begun(made.seat, made.attack, made.plan, draws.keys("tune", range(ROWS)))
+    return apart(made.program, first, lambda held: decided(made.seat, made.attack, made.plan, held), min(TRIED, made.seat.decisions))
