@@ -13,6 +13,7 @@ import enum
 import hashlib
 import sys
 import types
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path, PurePath
 from typing import Any, TypeVar, cast
@@ -63,14 +64,16 @@ class Reading:
 
     def __init__(self, graph: Graph, nodes: Sequence[Node]) -> None:
         self.graph = graph
-        direct: dict[int, list[tuple[int, int]]] = {}
+        direct, constant = (defaultdict[Any, tuple[list[int], list[Any]]](lambda: ([], [])) for _ in range(2))
         rest: list[tuple[int, Node]] = []
-        for i, node in enumerate(nodes):
-            if _is_parameter(node):
-                direct.setdefault(node.attr[0], []).append((i, node.attr[1]))
+        for i, node in enumerate(nodes):  # a recorded road is a table of 40,000 constants
+            if node.op == "const" or _is_parameter(node):
+                where, held = constant[node.dtype] if node.op == "const" else direct[node.attr[0]]
+                where.append(i)
+                held.append(node.attr if node.op == "const" else node.attr[1])
             else:
                 rest.append((i, node))
-        self._direct = {leaf: np.array(places).T for leaf, places in direct.items()}
+        self._direct = {leaf: (np.array(where), np.array(places)) for leaf, (where, places) in direct.items()}
         order, changing = ordered(node for _, node in rest), set()
         known: dict[int, Any] = {}
         for node in order:
@@ -83,6 +86,10 @@ class Reading:
         read = {a.id for node in self._order for a in node.args}
         self._known = {number: value for number, value in known.items() if number in read}  # not all, which may be many
         self._first = np.zeros(max(1, len(nodes)), np.uint64)
+        for dtype, (where, held) in constant.items():
+            bits = np.zeros(len(where), np.uint64)
+            bits.view(dtype)[:: bits.itemsize // dtype.itemsize] = held
+            self._first[where] = bits
         for i, node in rest:
             if node.id in known:
                 _write(self._first, i, node, known)
