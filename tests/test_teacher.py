@@ -17,6 +17,7 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import config_path
 from tailgate.engine.tracing import traced
 from tailgate.envs.gym.attacker_mdp import Seat
+from tailgate.estimators import Kalman
 from tailgate.play.metrics import crashed
 from tailgate.play.trace import rollout
 from tailgate.training import train
@@ -75,6 +76,21 @@ def test_a_long_demonstration_is_played_by_a_traced_program_with_the_same_bits(m
     plain = [demonstrate(seat, script, 0, episodes=7) for script in scripts]
     assert [[part.tobytes() for part in one] for one in found] == [[part.tobytes() for part in one] for one in plain]
     assert found[0].observation.shape[1] == 2 * len(seat.observation.columns) and not np.array_equal(found[0].action, found[1].action)
+
+
+def test_a_defence_that_fails_ends_a_traced_demonstration_with_the_plain_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Lost(Kalman):
+        def step(self, plan: Any, state: Any, received: Any, known_u: Any, draws: Any = None) -> Any:
+            state, estimate = super().step(plan, state, received, known_u, draws)
+            return state, estimate._replace(x=np.where(received.y[..., :1] < 45.0, np.nan, estimate.x))
+
+    seat = Seat.make(**(ENVIRONMENT | {"interval": 1, "defence": Lost()}))
+    with pytest.raises(InputError) as found:
+        demonstrate(seat, attack(SCRIPT), 0, episodes=3)
+    monkeypatch.setattr(teacher, "LONG", 10**9)
+    with pytest.raises(InputError) as wanted:
+        demonstrate(seat, attack(SCRIPT), 0, episodes=3)
+    assert str(found.value) == str(wanted.value)
 
 
 @pytest.mark.long

@@ -62,24 +62,30 @@ class Showing:
 
     def __init__(self, seat: Seat, attack: Attack, plan: object) -> None:
         check_open(seat.loop)
-        self.seat, self.attack, self.plan, self.values = seat, attack, plan, None
+        self.seat, self.attack, self.plan = seat, attack, plan
+        self.values: list[Array] | None = None  # of the parameters, if they differ from the traced ones
         self.program = Program(traced(self._traced, begun(seat, attack, plan, _ONE), None).pruned(keep=["loop.ended"]))
         self.programs = (self.program,)
 
-    def of(self, seat: Seat, attack: Attack, plan: object, values: list[Array] | None) -> Showing:
+    def of(self, seat: Seat, attack: Attack, plan: object, values: list[Array]) -> Showing:
         """Return the same program for parameters of other values."""
         out = copy.copy(self)
-        out.seat, out.attack, out.plan, out.values = seat, attack, plan, values  # type: ignore[assignment]
+        out.seat, out.attack, out.plan, out.values = seat, attack, plan, values
         return out
 
     def _traced(self, held: Shown, _: None) -> tuple[Shown, dict[str, Array]]:
         return decided(*lifted(held.loop.k, (self.seat, self.attack, self.plan)), held)
 
     def play(self, keys: Keys) -> dict[str, Array]:
-        """Return the results (K, B, ...) of all decisions."""
+        """Return the results (K, B, ...) of all decisions; raise the error of the first in which a demand fails."""
         state = self.program.rows(len(keys.key))
         state.put(begun(self.seat, self.attack, self.plan, keys))
-        return self.program.call(state, self.seat.decisions, self.values)()
+        call = self.program.call(state, max(2, self.seat.decisions), self.values)
+        out = call()
+        if call.broken:
+            k = int(np.argmin(out["demands"].all(axis=(1, 2))))
+            raise self.program.broken(out["demands"][k], np.full(len(keys.key), k + 1))
+        return out
 
 
 def begun(seat: Seat, attack: Attack, plan: Any, keys: Keys) -> Shown:
