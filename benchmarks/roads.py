@@ -1,7 +1,7 @@
 # ruff: noqa: E501 - tables
 """Real roads: the fit, false alarms on recordings, the time gap, and the order of defences on made-up and on recorded roads.
 
-    python benchmarks/roads.py [--out results/roads-v0] [--parts fit,alarms,order,gaps,aeb,speed] [--episodes 100]
+    python benchmarks/roads.py [--out results/roads-v0] [--parts fit,alarms,order,boards,gaps,aeb,speed] [--episodes 100]
 
 Each part writes PART.json into the folder, and a figure into docs/images with --figures. A part that has its file is not played again.
 """
@@ -23,6 +23,7 @@ from scipy.stats import kendalltau, spearmanr
 from tailgate.base.errors import NotApplicable
 from tailgate.base.files import write_atomic
 from tailgate.base.plots import canvas, png
+from tailgate.board.files import load
 from tailgate.core import draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, load_scenario, load_suite
@@ -153,6 +154,27 @@ def summary(harm: dict[str, Any]) -> dict[str, Any]:
     return out
 
 
+def part_boards(options: argparse.Namespace) -> dict[str, Any]:
+    """The order of the defences that both boards rank, of car following and of recorded roads: searched black-box attacks, mean over doses."""
+    one, two = (load(ROOT / "results" / name / "board.json.xz") for name in ("car-following-v1", "road-v0"))
+    held = [
+        {entry["defence"]: float(np.mean([rate["undamaged"]["value"] for rate in entry["rates"] if rate["knowledge"] == "black"]))
+         for entry in board["entries"] if entry["status"] == "ranked"} for board in (one, two)
+    ]  # fmt: skip
+    names = [name for name in held[0] if name in held[1]]
+    x, y = (np.array([part[name] for name in names]) for part in held)
+    rng, drawn = np.random.default_rng(0), []
+    for _ in range(RESAMPLES):
+        some = rng.integers(0, len(names), len(names))
+        if len(set(x[some])) > 1 and len(set(y[some])) > 1:
+            drawn.append(spearmanr(x[some], y[some]).statistic)
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    return {
+        "undamaged": {name: [float(a), float(b)] for name, a, b in zip(names, x, y, strict=True)},
+        "spearman": float(spearmanr(x, y).statistic), "spearman_interval": [float(low), float(high)],
+    }  # fmt: skip
+
+
 def part_gaps(options: argparse.Namespace) -> dict[str, Any]:
     """Collisions by time gap: the car of road-v0 at 0.8 to 3 s, under the worst script of the suite at each dose."""
     suite, out = load_suite("road-v0"), {}
@@ -205,7 +227,7 @@ def part_speed(options: argparse.Namespace) -> dict[str, Any]:
     return out
 
 
-PARTS = {"fit": part_fit, "alarms": part_alarms, "order": part_order, "gaps": part_gaps, "aeb": part_aeb, "speed": part_speed}
+PARTS = {"fit": part_fit, "alarms": part_alarms, "order": part_order, "boards": part_boards, "gaps": part_gaps, "aeb": part_aeb, "speed": part_speed}
 
 
 def draw_order(held: dict[str, Any]) -> bytes:
