@@ -62,7 +62,7 @@ def raised(play: Callable[[], T]) -> T | str:
 
 
 def apart(program: Program, begun: S, step: Callable[[S], tuple[S, Mapping[str, Array]]], steps: int) -> str:
-    """Play some steps of a program without arguments beside the plain `step`; return the first difference, or nothing.
+    """Play some steps of a program without arguments, and the same by the plain `step`; return the first difference, or nothing.
 
     begun: the state of ROWS episodes. step: returns the next state and its results.
     """
