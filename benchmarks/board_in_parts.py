@@ -3,7 +3,7 @@
     python benchmarks/board_in_parts.py road-v0 [--hours 2] [--workers 2]
 
 Searches belong to the code that made them. The first sitting notes the commit, and each sitting plays in a work tree of that commit, below
-.under-way. A sitting ends after some hours, or when the board is there: .under-way/SUITE/boards/SUITE then goes to results by hand.
+.under-way. A sitting ends after some hours, or when the board is there: .under-way/SUITE/results/SUITE then goes to results by hand.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def main() -> int:
         with tarfile.open(part) as held:
             held.extractall(tree, filter="data")
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it, and would pass that on
-    command = [sys.executable, "-m", "tailgate", "leaderboard", "run", options.suite, "--out", "boards", "--train"]
+    command = [sys.executable, "-m", "tailgate", "leaderboard", "run", options.suite, "--out", "results", "--train"]
     environment = os.environ | {"PYTHONPATH": str(tree / "src")}
     run = subprocess.Popen([*command, "--workers", str(options.workers)], cwd=tree, env=environment)
     until = time.monotonic() + 3600 * options.hours
@@ -75,7 +75,7 @@ def commit_of(kept: Path) -> str:
 
 def keep(tree: Path, suite: str, kept: Path) -> None:
     """Pack each finished search with the files of its attacks."""
-    for result in sorted(tree.glob(f"boards/{suite}/attacked/searches/*/searches/*.json")):
+    for result in sorted(tree.glob(f"results/{suite}/attacked/searches/*/searches/*.json")):
         packed = kept / f"{result.parents[1].name}-{result.stem}.tar.xz"
         if packed.exists():
             continue
