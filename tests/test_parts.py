@@ -22,7 +22,7 @@ def parts(tmp_path, monkeypatch):
 def test_a_finished_search_is_kept_with_its_files(parts, tmp_path):
     tree, kept = tmp_path / "tree", tmp_path / "kept"
     kept.mkdir()
-    place = Path("boards/s/attacked/searches/kf")
+    place = Path("results/s/attacked/searches/kf")
     (tree / place / "searches").mkdir(parents=True)
     (tree / place / "attacks").mkdir()
     texts = {f"{place}/attacks/a.json": "policy", f"{place}/attacks/a.safetensors": "weights", f"{place}/attacks/b.yaml": "program"}
