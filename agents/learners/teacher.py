@@ -122,7 +122,7 @@ def demonstrate(seat: Seat, attack: Attack, seed: int, episodes: int) -> Demonst
 
 
 def _played(seat: Seat, attack: Attack, plan: object, keys: Keys) -> dict[str, Array]:
-    """Return the results (K, B, ...) of all decisions, by a traced program where it pays."""
+    """Return the results (K, B, ...) of all decisions, by a traced program where it pays: decisions of many steps take long to compile."""
     if seat.action.spec.interval == 1 and (seat.loop.horizon >= LONG or seat.loop.horizon * len(keys.key) >= WORTH):
         made = _made.proved(
             (seat, attack, plan), lambda: decided(seat, attack, plan, begun(seat, attack, plan, _ONE)), lambda: Showing(seat, attack, plan),

@@ -287,7 +287,7 @@ def makers(graph: Graph) -> Iterator[None]:
         def maker(*args: Any, **options: Any) -> Any:
             if getattr(_here, "graph", None) is not graph:
                 return original(*args, **options)
-            if _plain(sys._getframe(1).f_globals.get("__name__", "")):
+            if _plain(str(sys._getframe(1).f_globals.get("__name__", ""))):
                 return original(*args, **options)
             if converts and not any(isinstance(part, Traced) for part in _inside(args[:1])):
                 return original(*args, **options)
