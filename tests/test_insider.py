@@ -18,16 +18,16 @@ from tailgate.play.trace import Trace, rollout
 
 from .engines import loop_of, trace_as_plain
 
-PLACE, CAR, FIRST, LENGTH = "platoon-stop-and-go-v0", 2, 61, 120
+PLACE, CAR, FIRST, LENGTH = "platoon-stop-and-go-v0", 2, 31, 60
 LAWS = {"cacc": {}, "ploeg_cacc": {}, "consensus_cacc": {"leader": "estimated"}}
-GRANT = {"kinds": ["insider"], "agents": [CAR]}
+GRANT = {"kinds": ["insider"], "agents": [CAR], "onset": 20}
 ATTACK = f"insider:start_step={FIRST},length={LENGTH},kp_scale=0.4,kd_scale=-0.5"
 
 
 def place_of(law="cacc", **threat):
     """A platoon without limits of the command, so that the law is all that a command is."""
     place = load_scenario(PLACE).with_threat(**GRANT | threat)
-    return dataclasses.replace(place, controller=make("controller", law, accel_min=None, accel_max=None, **LAWS[law]), horizon=200)
+    return dataclasses.replace(place, controller=make("controller", law, accel_min=None, accel_max=None, **LAWS[law]), horizon=100)
 
 
 def play(place, attack=ATTACK, defence="kf", seeds=range(3), **options):
@@ -67,8 +67,8 @@ def test_an_insider_drives_by_the_printed_law_with_other_gains(name):
 
 def test_the_car_follows_the_altered_command():
     """The speed and the place of the insider's car are those of a vehicle with lag under its commands, by scipy's matrix exponential."""
-    place = place_of()
-    trace, tau = play(place, terminate=False), place.plant.tau
+    place, attack = dataclasses.replace(place_of(), horizon=200), ATTACK.replace(f"length={LENGTH}", "length=120")
+    trace, tau = play(place, attack, terminate=False), place.plant.tau
     whole = expm(trace.dt * np.array([[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, -1 / tau, 1 / tau], [0, 0, 0, 0]]))
     state = np.stack([trace.signals[name][FIRST - 2, :, CAR] for name in ("position", "speed", "accel")], axis=1)
     for k in range(FIRST - 1, FIRST + 19):  # while nobody stands
@@ -81,7 +81,7 @@ def test_factors_of_one_change_nothing():
     """An insider that keeps its promise drives as if nobody attacked, to the last bit."""
     kept = play(place_of(), "insider:kp_scale=1,kd_scale=1", "none")
     clean = play(place_of(), "none", "none")
-    assert kept.target[50:].any()
+    assert kept.target[19:].any()
     for name in ("truth", "wires", "estimate", "control", "applied", "gap"):
         assert np.array_equal(kept.signals[name], clean.signals[name]), name
 
@@ -99,13 +99,13 @@ def test_the_wires_arrive_as_they_were_sent():
 def test_an_insider_heeds_no_defence_of_its_own():
     """A defence that fixes the command of every car fixes that of the others."""
     defence = "composed:detector=chi2,mitigation=sliding_mode,mitigation.when=always"
-    trace, clean = play(place_of(), defence=defence), play(place_of(), "none", defence)
-    k = FIRST - 1
+    k, place = FIRST - 1, dataclasses.replace(place_of(), horizon=FIRST)
+    trace, clean = play(place, defence=defence), play(place, "none", defence)
     assert np.array_equal(trace.control[:k], clean.control[:k])
     others = [i for i in range(5) if i != CAR]
     assert np.array_equal(trace.control[k][:, others], clean.control[k][:, others])
     assert (trace.control[k][:, CAR] != clean.control[k][:, CAR]).all()
-    brake, calm = play(place_of(), defence="always_brake"), play(place_of(), "none", "always_brake")
+    brake, calm = play(place, defence="always_brake"), play(place, "none", "always_brake")
     assert (brake.control[k, :, CAR] > calm.control[k, :, CAR]).all() and (calm.control[k, :, CAR] <= -2.0).all()
 
 
@@ -131,7 +131,7 @@ def test_a_command_beyond_the_threat_model_is_refused():
         (loop, CAR, 1, 1.0, True), (loop, 0, 0, 1.0, True), (loop, 1, 0, 1.0, True), (other, CAR, 0, 1.0, True),
     ):  # fmt: skip
         state = place.start(draws.keys("train", [0]))
-        for _ in range(50):
+        for _ in range(20):
             state, _, _ = place.step(state, tailgate.make_attack("none"), place.brief, None)
         target = np.zeros((1, 5, 7), bool)
         target[0, agent, wire] = True
@@ -178,7 +178,7 @@ def test_learners_do_not_choose_it():
 @pytest.mark.parametrize("law", LAWS)
 def test_the_traced_engine_plays_it_to_the_bit(law, tmp_path, monkeypatch):
     """With the attack in plain code, and traced as well."""
-    loop, rival = loop_of(PLACE, "chi2_kf", ATTACK, **GRANT)
+    loop, rival = loop_of(PLACE, "chi2_kf", ATTACK.replace(f"={FIRST},length={LENGTH}", "=21,length=20"), 50, **GRANT)
     object.__setattr__(loop, "controller", make("controller", law, **LAWS[law]))
     plain = trace_as_plain(loop, rival)
     assert (plain.kind == 10).any()
