@@ -29,7 +29,7 @@ from tailgate.play.metrics import METRICS
 from tailgate.play.trace import Trace, episodes_at_once, rollout
 
 PLACE = "thesis-ch4-v0"  # a short one
-SUITE = Suite("small", "", (PLACE,), (12,), ("kf", "chi2_kf"), ("none", "fdi:start_step=60,value=-4"), 9)
+SUITE = Suite("small", "", ("linear-dos-v0",), (12,), ("kf", "chi2_kf"), ("none", "dropout:start_step=30,probability=0.5"), 9)  # the fewest steps
 
 
 def _results(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:

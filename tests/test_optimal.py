@@ -64,7 +64,7 @@ def test_they_are_ceilings():
     [Rules(1, 10, 4, 10, 0), Rules(3, 9, 4, 10, 0), Rules(1, 10, 5, 2, 0), Rules(2, 10, 4, 3, 3), Rules(1, 10, 10, 1, 2), Rules(4, 4, 3, 9, 0)],
 )
 @pytest.mark.parametrize("states, a, seed", [(1, 1.2, 0), (1, 0.7, 0), (2, 1.0, 0), (2, 1.1, 2), (3, 0.95, 1)])
-@pytest.mark.thin(3)
+@pytest.mark.thin(7)
 def test_the_schedule_is_as_good_as_the_best_of_all(states, a, seed, rules, objective):
     """Brute force over all 1024 schedules of ten steps that the threat model accepts."""
     filtering, P = system(a, states, seed), 2.0 * np.eye(states)

@@ -31,7 +31,7 @@ from tailgate.training.selfplay import Game, GameConfig, load_config
 ROAD = {"scenario": "gusty-stop-and-go-v0", "interval": 60, "menu": {"thresholds": [6.0, 1e9], "modes": ["normal", "brake"]}, "knowledge": "black"}
 FDI = "fdi:trigger=near,threshold=40,value=-4"
 SMALL = Config(population=6, episodes=4, hidden=(4,))
-ROUND = 6 * 4 * 10  # decisions of a generation without a collision
+ROUND = 6 * 4 * 5  # decisions of a generation without a collision
 
 
 def attacks(*names):
@@ -40,10 +40,10 @@ def attacks(*names):
 
 @pytest.fixture(scope="module")
 def brief(tmp_path_factory):
-    """A scenario file with the road of ROAD and a quarter of its time."""
+    """A scenario file with the road of ROAD and an eighth of its time."""
     path = tmp_path_factory.mktemp("scenario") / "brief.yaml"
-    text = config_path("scenarios", ROAD["scenario"], "scenario").read_text().replace("horizon: 600", "horizon: 150")
-    path.write_text(text.replace("end: 500", "end: 150").replace("onset: 50", "onset: 10"))
+    text = config_path("scenarios", ROAD["scenario"], "scenario").read_text().replace("horizon: 600", "horizon: 75")
+    path.write_text(text.replace("end: 500", "end: 75").replace("onset: 50", "onset: 10"))
     return ROAD | {"scenario": str(path), "interval": 15}
 
 
@@ -123,7 +123,7 @@ def test_it_begins_at_the_defence_as_it_is():
 
 
 TINY = [
-    "name=tiny", "steps=1", "rounds=1", "episodes=6", "rivals=[dos_jam]", "environment.interval=50", "environment.frames=2", "menu.thresholds=[20, 1.0e+9]",
+    "name=tiny", "steps=1", "rounds=1", "episodes=6", "rivals=[dos_jam]", "environment.interval=25", "environment.frames=2", "menu.thresholds=[20, 1.0e+9]",
     "menu.modes=[normal]", "attacker={population: 4, episodes: 2, hidden: [2]}", "defender={population: 4, episodes: 2, hidden: [2]}",
 ]  # fmt: skip
 GUARDS = ("as it is", "best fixed setting", "trained")
