@@ -33,7 +33,7 @@ from .distributed import RNG, error, model_of, place_of, play, random_state
 NAMES = ("chi2_dkf", "consensus_kf", "disagreement_dkf", "dkf_oracle", "saturated_dkf", "trimmed_consensus", "trust_dkf")
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("place", ["thesis-ch5-v0", "weak", "platoon-braking-v0"])
 @pytest.mark.parametrize("defence", NAMES)
 def test_they_stay_finite_and_their_rows_do_not_depend_on_the_batch(defence, place):

@@ -25,8 +25,8 @@ from tailgate.ensemble.injection import Course, Injection  # noqa: E402
 FDI = {"kinds": ("fdi",), "onset": 2, "end": None, "budget": None}
 SMOOTH = {"car": ("stop-and-go-v0", "kf", 40), "platoon": ("platoon-gusty-v0", "dkf", 8)}
 LOOPS = {
-    "car": ("gusty-stop-and-go-v0", "chi2_kf", 40), "radar": ("radar-braking-v0", "chi2_kf", 30), "platoon": ("platoon-gusty-v0", "dkf", 20),
-    "network": ("network-restless-v0", "dkf", 8), "loops": ("network-restless-v0", "lasso_dkf", 4), "blends": ("network-restless-v0", "chi2_dkf", 5),
+    "car": ("gusty-stop-and-go-v0", "chi2_kf", 40), "radar": ("radar-braking-v0", "chi2_kf", 30), "network": ("network-restless-v0", "dkf", 8),
+    "platoon": ("platoon-gusty-v0", "dkf", 20), "loops": ("network-restless-v0", "lasso_dkf", 4), "blends": ("network-restless-v0", "chi2_dkf", 5),
 }  # fmt: skip
 
 

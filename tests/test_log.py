@@ -178,7 +178,7 @@ class Killed(BaseException):
     """Not an Exception: nothing on the way may catch it."""
 
 
-@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.long), 4])
+@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.long), 6])
 def test_a_log_that_is_killed_anywhere_goes_on(every: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """At writes, fsyncs and renames in turn: parts that were finished are kept, and the bytes are those of a log in peace."""
     options = {"episodes": 1, "dev_episodes": 1, "defences": ["chi2_kf"], "attacks": ["dropout"]}

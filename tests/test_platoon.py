@@ -162,7 +162,7 @@ def test_topologies():
 @pytest.mark.thin(2)
 def test_messages_carry_what_their_names_say(topology):
     """Accelerations of predecessor and leader at this step, what drove the predecessor in the last; 0 from a leader that is not heard."""
-    trace = play(place_of(topology=topology, horizon=400), seeds=range(3), terminate=False)
+    trace = play(place_of(topology=topology, horizon=400), "none", seeds=range(3), terminate=False)
     graph = Platoon(topology=topology).hears()
     sent, accel, applied = trace.clean[..., 3:], trace.truth[:, :, 0, [Column.accel(i) for i in range(5)]], trace.applied[..., 0]
     np.testing.assert_array_equal(sent[:, :, 1:, 0], accel[:, :, :-1])

@@ -55,7 +55,7 @@ MINIMAL = {"steps": "at: [3, [7, 30]]", "chance": "probability: 0.3", "bursts": 
            "speed": "threshold: 20", "slow": "threshold: 30", "leader_braking": "threshold: 0", "time": "start: 9", "reading": "threshold: 20, latest: 30"}  # fmt: skip
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("kind", ALL)
 @pytest.mark.parametrize("trigger", TRIGGERS)
 def test_every_trigger_plays_with_every_kind(trigger, kind, short, loop_of, write):
