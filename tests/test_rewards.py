@@ -16,10 +16,10 @@ from tailgate.play.metrics import METRICS
 from tailgate.play.trace import rollout
 
 
-def _episode(interval=1, **options):
-    """Two environments with the same episodes, with shaping and without it: first themselves, then a pair of outputs per step."""
+def _episode(interval=1, shaped=True, **options):
+    """Environments with the same episodes, with shaping if asked and without it: first themselves, then their outputs per step."""
     envs = []
-    for extra in ({}, {"gap_shaping": 0.0, "error_shaping": 0.0}):
+    for extra in ([{}] if shaped else []) + [{"gap_shaping": 0.0, "error_shaping": 0.0}]:
         options |= {"scenario": "gusty-stop-and-go-v0", "value": -20.0, "interval": interval}
         env = AdversaryVectorEnv(8, engine="plain", autoreset="disabled", **options, **extra)
         env.seat = env.episodes.seat = dataclasses.replace(env.seat, loop=dataclasses.replace(env.seat.loop, horizon=240))
@@ -37,7 +37,7 @@ def _episode(interval=1, **options):
 
 @pytest.mark.parametrize("interval", [1, 5])
 @pytest.mark.parametrize("reward", ["collision", "min_gap", "error", "stealth"])
-@pytest.mark.thin(2)
+@pytest.mark.thin(3)
 def test_shaping_telescopes(reward, interval):
     """The discounted sum of what shaping adds is gamma^T Phi(end) - Phi(start), Phi(end) = 0 at a collision: no policy gains."""
     total, discount = np.zeros(8), 1.0
@@ -60,9 +60,9 @@ def test_raw_rewards(interval):
     paid = {name: np.zeros(8) for name in ("collision", "min_gap", "error", "stealth")}
     for name in paid:
         least, alarms, crashed = np.full(8, 20.0), np.zeros(8), np.zeros(8, bool)
-        episode = _episode(reward=name, interval=interval)
-        (_, bare), _ = next(episode)
-        for _, (_, two) in episode:
+        episode = _episode(reward=name, interval=interval, shaped=False)
+        (bare,), _ = next(episode)
+        for _, (two,) in episode:
             paid[name] += two[1]
             crashed |= two[2]
             least = np.minimum(least, bare.frame.scene.gap[:, 0])
