@@ -22,6 +22,7 @@ from tailgate.evaluation.attack_list import Admitted
 from tailgate.evaluation.cells import cells_of, run
 from tailgate.evaluation.paired import settled
 from tailgate.evaluation.rows import encode
+from tailgate.play import trace
 
 spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
 assert spec is not None and spec.loader is not None
@@ -299,6 +300,12 @@ def test_hits_that_are_not_of_the_cell() -> None:
 TEXT = "about: s\nscenarios: [thesis-ch4-v0]\ndoses: [5]\ndefences: [none, kf, chi2_kf]\nattacks: [none, 'fdi:value=5']\nseeds: 4\n"
 
 
+@pytest.fixture
+def compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Attacks are played by compiled code too, which has the bits of plain code."""
+    monkeypatch.setattr(trace, "MANY", 1)
+
+
 def _run(*arguments: str) -> None:
     parser = argparse.ArgumentParser()
     command.add(parser.add_subparsers())
@@ -306,7 +313,7 @@ def _run(*arguments: str) -> None:
     assert options.run(options) == 0
 
 
-def test_the_command(tmp_path: Path) -> None:
+def test_the_command(compiled: None, tmp_path: Path) -> None:
     """A board that is there grows by an entry; without the flag it is one of the rows alone."""
     file, out = tmp_path / "small-v0.yaml", tmp_path / "out"
     file.write_text(TEXT)
@@ -346,7 +353,7 @@ def test_the_command(tmp_path: Path) -> None:
     assert [e["defence"] for e in json.loads(place.read_text())["entries"]] == ["none", "chi2_kf"]
 
 
-def test_the_command_plays_what_all_others_have_met(tmp_path: Path) -> None:
+def test_the_command_plays_what_all_others_have_met(compiled: None, tmp_path: Path) -> None:
     """Whoever joins by name meets it without being asked; a board that names code to import is refused, and a suite of one's own is not."""
     file, out = tmp_path / "small-v0.yaml", tmp_path / "out"
     file.write_text(TEXT)

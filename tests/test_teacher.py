@@ -30,6 +30,18 @@ ENVIRONMENT: dict[str, Any] = {
 SMALL = Config(envs=16, rollout=24, batch_size=192, epochs=1, hidden=(16,))
 
 
+@pytest.fixture(scope="module")
+def brief(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A file with a fifth of the scenario's time."""
+    place = config_path("scenarios", ENVIRONMENT["scenario"], "scenario").read_text()
+    for whole, part in (("horizon: 600", "horizon: 120"), ("onset: 50", "onset: 10"), ("end: 500", "end: 120")):
+        assert whole in place
+        place = place.replace(whole, part)
+    path = tmp_path_factory.mktemp("brief") / "brief.yaml"
+    path.write_text(place)
+    return str(path)
+
+
 def attack(text: str) -> Any:
     return Spec("attack", text).make()
 
@@ -64,11 +76,12 @@ def test_a_demonstration_is_the_script_and_its_returns() -> None:
     assert not np.array_equal(other.observation[:64], shown.observation[:64])
 
 
-def test_a_long_demonstration_is_played_by_a_traced_program_with_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_demonstration_is_played_by_a_traced_program_with_the_same_bits(brief: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two frames are shown at each decision; another script of the class is traced no more."""
-    seat = Seat.make(**(ENVIRONMENT | {"interval": 1, "frames": 2}))
-    scripts = [attack(SCRIPT), attack(SCRIPT.replace("40", "50"))]
-    traces = []
+    seat = Seat.make(**(ENVIRONMENT | {"scenario": brief, "interval": 1, "frames": 2}))
+    scripts = [attack(f"fdi_then_jam:start_step={step},inject=10") for step in (30, 50)]
+    traces: list[int] = []
+    monkeypatch.setattr(teacher, "LONG", 1)
     monkeypatch.setattr(teacher, "traced", lambda *arguments: traces.append(1) or traced(*arguments))
     found = [demonstrate(seat, script, 0, episodes=7) for script in scripts]
     assert len(traces) == 1
@@ -105,17 +118,12 @@ def test_who_was_shown_a_script_does_what_it_does(tmp_path: Path) -> None:
     assert rates[0] < 0.05 and rates[2] > 0.3 and rates[1] > 0.6 * rates[2], rates
 
 
-def test_a_taught_run_resumes_to_the_same_policy(tmp_path: Path) -> None:
+def test_a_taught_run_resumes_to_the_same_policy(tmp_path: Path, brief: str) -> None:
     """The lesson comes before the first decision, once: an interrupted run is not taught again."""
-    place = config_path("scenarios", ENVIRONMENT["scenario"], "scenario").read_text()
-    for whole, part in (("horizon: 600", "horizon: 120"), ("onset: 50", "onset: 10"), ("end: 500", "end: 120")):
-        assert whole in place
-        place = place.replace(whole, part)
-    (tmp_path / "brief.yaml").write_text(place)
     script = "fdi_then_jam:start_step=30,inject=20"
     settings = [
         "seeds=1", "workers=1", "environment.interval=20", "ppo.envs=16", "ppo.rollout=15", "ppo.batch_size=120", "ppo.epochs=1", "ppo.hidden=[8]",
-        "tensorboard=false", "checkpoint_every=240", f"teacher='{script}'", "white_box=[]", f"scenario={tmp_path / 'brief.yaml'}",
+        "tensorboard=false", "checkpoint_every=240", f"teacher='{script}'", "white_box=[]", f"scenario={brief}",
     ]
     entire = train.load_config("gusty", [f"out={tmp_path / 'whole'}", "steps=960", *settings])
     straight = train.train(entire, lambda seed, now: None)[0].with_suffix(".safetensors").read_bytes()
