@@ -123,7 +123,7 @@ def test_a_number_of_gaussians_that_nobody_can_want(J):
 
 def test_the_traced_engine_plays_it_to_the_bit():
     """67 episodes of car following, the loop alone and with the attack."""
-    loop, rival = loop_of("stop-and-go-v0", "bernoulli:components=3", "fdi:value=-6,start_step=60,targets=[position]", 120)
+    loop, rival = loop_of("stop-and-go-v0", "bernoulli:components=3", "fdi:value=-6,start_step=52,targets=[position]", 70)
     plain = trace_as_plain(loop, rival)
     assert plain.alarm.any()
     whole = rollout_of(loop, rival)
