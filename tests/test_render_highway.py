@@ -74,6 +74,7 @@ def said(monkeypatch):
     return words
 
 
+@pytest.mark.thin(5)
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("name", ROADS)
 def test_every_road_has_a_picture_at_every_size(name, size, same_tree):
@@ -314,6 +315,7 @@ def test_wrong_viewers_and_sizes_are_named(arguments, words):
         AdversaryVectorEnv(1, **arguments)
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", ROADS)
 def test_the_window_shows_the_road(name, monkeypatch):
     """Human mode under a dummy video driver shows what rgb_array returns, at the size that was asked for."""
