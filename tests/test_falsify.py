@@ -62,9 +62,9 @@ def test_genes_are_quantiles_of_the_draws():
 def test_the_row_of_a_genome_is_its_text(same_bits):
     """A trial in a batch has the robustness, to the last bit, that its text has in the plain engine."""
     case = Case("quick-v0", "gusty-stop-and-go-v0", 12, "chi2_kf", (), "G[0,60] gap > 2")
-    genomes = np.random.default_rng(3).random((6, len(case.genes)))
-    found = case.robustness(genomes, np.tile([0, 1], (6, 1)))
-    for i, genome in enumerate(genomes[:3]):
+    genomes = np.random.default_rng(3).random((4, len(case.genes)))
+    found = case.robustness(genomes, np.tile([0, 1], (4, 1)))
+    for i, genome in enumerate(genomes[:2]):
         choice = case.choice(genome)
         keys = road.Steered.of(
             draws.keys("tune", [0, 1]),
@@ -145,13 +145,13 @@ def FAULT_BRIEF():
 
 
 def test_a_planted_fault_is_found_and_shrunk(planted, tmp_path):
-    """The sound filter stands the same search. The attack is shrunk to a tenth of its steps, and no step of it is idle."""
-    report = falsify(Search(FAULT, trials=64, seed=2), tmp_path)
+    """The sound filter stands the same search. The attack is shrunk to a tenth of its steps, and no step of it is idle, of those that are tried."""
+    report = falsify(Search(FAULT, trials=32, seed=2), tmp_path)
     found = report["counterexample"]
     assert report["violated"] and report["violations"] > 0
     assert found["found"]["steps"] >= 30 and 10 * found["steps"] <= found["found"]["steps"]
     assert found["robustness"] < 0.0 and len(found["commands"]) == found["steps"]
-    sound = search.search(Search(dataclasses.replace(FAULT, defence="kf"), trials=64, seed=2))
+    sound = search.search(Search(dataclasses.replace(FAULT, defence="kf"), trials=32, seed=2))
     assert sound.robustness > 0.0
     again = replayed(tmp_path / run.COUNTEREXAMPLE, "planted:SignError")
     assert again["same"] and again["formulas"] == found["formulas"]
@@ -159,7 +159,7 @@ def test_a_planted_fault_is_found_and_shrunk(planted, tmp_path):
     assert (whole["formula"], parts[0]["formula"]) == ("G[0, 60] (gap_error < 80)", "gap_error < 80")
     assert whole["along"][0] == found["robustness"] == min(parts[0]["along"])
     data = json.loads((tmp_path / run.COUNTEREXAMPLE).read_text())
-    for i in range(len(data["commands"])):
+    for i in range(0, len(data["commands"]), 4):
         less = data | {"commands": data["commands"][:i] + data["commands"][i + 1 :]}
         (tmp_path / "less.json").write_text(json.dumps(less))
         assert replayed(tmp_path / "less.json", "planted:SignError")["robustness"] >= 0.0
@@ -172,15 +172,15 @@ def test_a_schedule_plays_what_was_recorded():
     case = Case("", "gusty-stop-and-go-v0", 20, "chi2_kf", (), "G gap > 2")
     keys = draws.keys("tune", [4])
     for text in (
-        "dos_hold:start_step=100",
-        "fdi_ramp:trigger=near,threshold=40",
-        "dropout:start_step=80,burst=3,pause=2",
-        "dos_jam:start_step=90",
+        "dos_hold:start_step=60",
+        "fdi_ramp:trigger=near,threshold=100",
+        "dropout:start_step=70,burst=3,pause=2",
+        "dos_jam:start_step=80",
     ):
-        loop = case.loop(text)
+        loop, none = (dataclasses.replace(case.loop(name), horizon=120) for name in (text, "none"))
         trace = rollout(loop, Spec("attack", text).make(), keys)
-        again = rollout(case.loop("none"), recorded(trace, loop.horizon), keys, plain=True)
-        assert trace.decision_hash(0) == again.decision_hash(0) and np.array_equal(trace.gap, again.gap)
+        again = rollout(none, recorded(trace, loop.horizon), keys, plain=True)
+        assert (trace.kind != 0).any() and trace.decision_hash(0) == again.decision_hash(0) and np.array_equal(trace.gap, again.gap)
 
 
 @pytest.mark.parametrize(("changes", "expected"), [

@@ -231,7 +231,7 @@ def test_bisection_finds_the_border_of_a_linear_bound():
 
 
 def test_a_smaller_budget_proves_no_less():
-    found = [Tube(affine_loop(lane(budget=n), at_rest=True), alpha=1e-3).largest(10.0, limits=False) for n in (0, 1, 5, 40, None)]
+    found = [Tube(affine_loop(dataclasses.replace(lane(budget=n), horizon=80), at_rest=True), alpha=1e-3).largest(10.0, limits=False) for n in (0, 1, 5, 40, None)]
     assert found[0] == 10.0 and all(a >= b for a, b in itertools.pairwise(found)) and found[3] > found[4] * 0.99
 
 
@@ -256,7 +256,7 @@ def test_a_late_message_is_worse_only_if_it_is_led_on():
 def test_the_largest_delay_is_the_one_at_which_an_attack_uses_up_the_gap():
     """An injection that leaves a centimetre at 3 steps of delay takes it at 4; one that takes all without a delay leaves no delay."""
     rest = {"at_rest": True, "lead": (-0.5, 0.5)}
-    place = car(targets=("position",))
+    place = dataclasses.replace(car(targets=("position",)), horizon=80)
     place = dataclasses.replace(place, controller=dataclasses.replace(place.controller, standstill=2.0, headway=0.5))
     tubes = [Tube(affine_loop(place, delay=delay, **rest)) for delay in range(5)]
     step = int(np.argmin(tubes[3].lower_gap(0.0)))
