@@ -33,6 +33,12 @@ PLAN = {
 SMALL = Suite("small-v0", "", (ROAD,), (12,), ("none", "kf"), ("none", "fdi:value=-4"), 3, {"kinds": ["fdi"], "fdi_bound": 5.0})
 
 
+@pytest.fixture
+def compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Attacks are played by compiled code too, which has the bits of plain code."""
+    monkeypatch.setattr("tailgate.play.trace.MANY", 1)
+
+
 def test_a_knowledge_that_nobody_was_met_with_has_no_figures() -> None:
     """They would be a lower one's: where no attack knows so much, where none can look into the only defence, and where another was met."""
     where, gone = suite(attacks=("none", "fdi", "white")), {"knowledge": "white", "status": "skipped", "reason": "no look"}
@@ -48,7 +54,7 @@ def test_a_knowledge_that_nobody_was_met_with_has_no_figures() -> None:
     assert rate(entry(own, "a"), 20, "white")["worst"]["attack"] == trained and rate(entry(own, "a"), 20)["undamaged"]["value"] == 0.8
 
 
-def test_rows_of_another_threat_model_are_refused() -> None:
+def test_rows_of_another_threat_model_are_refused(compiled: None) -> None:
     """A weaker attacker under the suite's name: the scenario's hash tells."""
     rows = evaluate(SMALL)
     assert score(rows, SMALL, require_adaptive=False)["suite"]["rows"] == len(rows)
@@ -144,7 +150,7 @@ def test_an_interval_holds_what_was_measured() -> None:
     assert found["value"] is None and found["high"] is None and found["low"] is not None
 
 
-def test_a_folder_is_scored_and_half_done_work_is_not(tmp_path: Path) -> None:
+def test_a_folder_is_scored_and_half_done_work_is_not(compiled: None, tmp_path: Path) -> None:
     """What lies in hidden folders and among policies counts not; a second run plays nothing again; a compressed file that was cut is refused."""
     file = play(SMALL, tmp_path)
     assert file.name == OWN and (first := board_of(SMALL, tmp_path, require_adaptive=False))["entries"]

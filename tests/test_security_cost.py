@@ -155,7 +155,7 @@ def test_a_loop_in_which_all_collide_is_not_recommended():
 
 def played_in(attack, defence="kf", scenario=V2V, **threat):
     guard = Spec("defence", defence)
-    place = load_scenario(scenario).with_threat(**threat)
+    place = dataclasses.replace(load_scenario(scenario), horizon=75).with_threat(**threat)
     return rollout(place.loop(guard.make(), guard.entry.uses), Spec("attack", attack).make(), draws.keys("report", range(12)))
 
 
@@ -178,7 +178,7 @@ def test_with_all_messages_authenticated_every_forged_cell_is_the_clean_one(atta
     assert not same(open_, clean)
 
 
-@pytest.mark.parametrize("attack", ["dos_hold:start_step=200", "dropout:start_step=200"])
+@pytest.mark.parametrize("attack", ["dos_hold:start_step=60", "dropout:start_step=60"])
 def test_a_tag_does_not_keep_a_message_from_being_lost(attack):
     sealed = played_in(attack, authenticated=FIELDS)
     assert same(sealed, played_in(attack)) and (sealed.kind != 0).any() and not sealed.refused.any()
@@ -203,7 +203,7 @@ def test_other_wires_stay_open():
 def test_the_compiled_loop_seals_as_the_plain_one_does(attack):
     from .engines import loop_of
 
-    trace_as_plain(*loop_of("platoon-v2v-v0", "kf", attack, horizon=120, authenticated=["predecessor_command"], key_interval=2))
+    trace_as_plain(*loop_of("platoon-v2v-v0", "kf", attack, horizon=80, authenticated=["predecessor_command"], key_interval=2))
 
 
 def test_a_threat_model_without_tags_leaves_no_mark():
