@@ -40,11 +40,11 @@ def attacks(*names):
 
 @pytest.fixture(scope="module")
 def brief(tmp_path_factory):
-    """A scenario file with the road of ROAD and an eighth of its time."""
+    """A scenario file with the road of ROAD and a twelfth of its time."""
     path = tmp_path_factory.mktemp("scenario") / "brief.yaml"
-    text = config_path("scenarios", ROAD["scenario"], "scenario").read_text().replace("horizon: 600", "horizon: 75")
-    path.write_text(text.replace("end: 500", "end: 75").replace("onset: 50", "onset: 10"))
-    return ROAD | {"scenario": str(path), "interval": 15}
+    text = config_path("scenarios", ROAD["scenario"], "scenario").read_text().replace("horizon: 600", "horizon: 50")
+    path.write_text(text.replace("end: 500", "end: 50").replace("onset: 50", "onset: 10"))
+    return ROAD | {"scenario": str(path), "interval": 10}
 
 
 def run(road, steps, seed=0, rivals=("fdi:value=-4", "none"), **options):

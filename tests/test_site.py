@@ -173,6 +173,8 @@ def test_every_entry_and_attack_of_a_published_board_has_a_whole_card(tmp_path):
         told = facts(text, name, 4)
         assert told["Licence"] == "MIT" and told["Threat model"] == granted and (ROOT / told["Code"].split(", ")[0]).is_file()
         assert "cem (gamma=1.0" in told["Training"] if name == "policy" else told["Training"] == "none"
+    board |= {"entries": [e for e in board["entries"] if e["defence"] == "kf"], "comparisons": [], "curves": [], "detection": None}
+    board["cells"] = [cell for cell in board["cells"] if cell["defence"] == "kf"]
     board["suite"]["hash"] = "0" * 16  # of another suite under the name: nothing is said of what it grants
     other = facts(entry(build_site([board], tmp_path, replays=False), "kf", "quick-v0").read_text(encoding="utf-8"), "Card")
     assert "Threat model" not in other and other["Licence"] == "MIT"
