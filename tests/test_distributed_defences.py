@@ -63,7 +63,8 @@ def test_without_attack_and_noise_they_converge(defence):
 # --- the gate ---------------------------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("gain", ["steady", "varying"])
+@pytest.mark.thin(2)
+@pytest.mark.parametrize("gain", ["varying", "steady"])
 def test_a_gate_that_never_shuts_is_no_gate(gain, same_bits):
     """chi2_dkf with an enormous eta has the bits of dkf; with a tiny one it uses no reading."""
     wide = play("thesis-ch5-v0", f"chi2_dkf:eta=1e30,gain={gain}", "fdi", value=50.0)
@@ -122,7 +123,8 @@ def test_a_steady_gate_stays_locked_where_the_varying_one_opens_again():
 # --- saturated innovations ----------------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("gain", ["steady", "varying"])
+@pytest.mark.thin(2)
+@pytest.mark.parametrize("gain", ["varying", "steady"])
 def test_without_a_limit_saturation_is_the_plain_filter(gain, same_bits):
     """saturated_dkf with an enormous gamma has the bits of dkf under attack; with the default it has not."""
     plain = play("thesis-ch5-v0", f"dkf:gain={gain}", "fdi", value=50.0).estimate
@@ -168,7 +170,8 @@ def test_saturation_counts_the_readings_that_are_used():
 # --- neighbours who disagree --------------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("centre", ["own", "median"])
+@pytest.mark.thin(2)
+@pytest.mark.parametrize("centre", ["median", "own"])
 def test_who_never_disagrees_is_fused_as_ever(centre, same_bits):
     """disagreement_dkf with an enormous threshold has the bits of chi2_dkf."""
     for place, value in (("thesis-ch5-v0", 3.0), ("platoon-braking-v0", 2.0)):

@@ -207,6 +207,7 @@ def test_the_strongest_attack_of_the_tube_does_in_the_loop_what_the_tube_says(tm
     assert len(steps) == 25 and abs(off) == pytest.approx(size * tube.pushed["gap"][k - 1].max(), rel=1e-4)
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("seed", range(3))
 def test_what_is_proved_is_below_every_attack_that_does_damage(seed):
     """On a linear system: errors that the best stealth attack reaches with a bound are never below what the tube allows at that bound."""
@@ -308,6 +309,7 @@ def test_the_closed_form_needs_a_bound_on_how_the_car_ahead_brakes():
     assert reacting(hard).lead_brake == 7.5
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize(
     ("manoeuvre", "wanted"),
     [("braking", (-4.0, 0.0)), ("stop_and_go", (-3.0, 1.5)), ("ornstein_uhlenbeck", (-3.0, 3.0)), ("sine", (-0.5, 0.5)), ("switched", (-0.1082, 0.012)),

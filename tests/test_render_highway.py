@@ -89,6 +89,7 @@ def test_every_road_has_a_picture_at_every_size(name, size, same_tree):
     assert not same_tree(before, env.state)
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", ROADS)
 def test_drawing_changes_no_bit_of_an_episode(name):
     """The same observations, rewards and states with a picture of every step and without any, over the end of episodes; no random source moves."""
