@@ -7,6 +7,7 @@ import io
 import json
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -123,7 +124,7 @@ def test_it_begins_at_the_defence_as_it_is():
 
 
 TINY = [
-    "name=tiny", "steps=1", "rounds=1", "episodes=6", "rivals=[dos_jam]", "environment.interval=25", "environment.frames=2", "menu.thresholds=[20, 1.0e+9]",
+    "name=tiny", "steps=1", "rounds=1", "episodes=6", "rivals=[dos_jam]", "environment.interval=50", "environment.frames=2", "menu.thresholds=[20, 1.0e+9]",
     "menu.modes=[normal]", "attacker={population: 4, episodes: 2, hidden: [2]}", "defender={population: 4, episodes: 2, hidden: [2]}",
 ]  # fmt: skip
 GUARDS = ("as it is", "best fixed setting", "trained")
@@ -134,10 +135,12 @@ NAMES = ("none", "dos_jam", "attacker-1", "fresh-0", "fresh-fixed-0")
 def first(brief, tmp_path_factory):
     """The directory in which a run of one round was played, and what the command printed."""
     home, out = tmp_path_factory.mktemp("first"), io.StringIO()
+    text = Path(brief["scenario"]).read_text()  # of three times as many steps, so that somebody collides
+    (home / "brief.yaml").write_text(text.replace("horizon: 50", "horizon: 150").replace("end: 50", "end: 150"))
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out):
         patch.chdir(home)
         patch.setattr(selfplay, "SELECT_EPISODES", 8)
-        assert cli.main(["selfplay", *TINY, f"scenario={brief['scenario']}", "--json"]) == 0
+        assert cli.main(["selfplay", *TINY, f"scenario={home / 'brief.yaml'}", "--json"]) == 0
     return home, json.loads(out.getvalue())
 
 
