@@ -78,6 +78,7 @@ def test_scenario_one_is_survived_with_the_joint_regression(attack):
     assert np.median(trace.gap[-1]) == pytest.approx(5.03, abs=0.01)
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("defence", ["none", "algorithm2", f"{FIXED},filter=hold_last", "pycra:challenge=fixed", f"{FIXED},watch=none,freeze=false"])
 @pytest.mark.parametrize("attack", [JAM, LATE])
 def test_scenario_one_collides_in_every_run_without_it(attack, defence):
@@ -94,6 +95,7 @@ def test_without_roll_back_the_late_echo_stays_in_the_fit():
     assert crashed(played(f"{FIXED},rollback=false", LATE)).all()
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("onset", [51, 100, 150])
 def test_a_list_that_the_attacker_knows_loses(onset):
     """With challenges at 15, 50 and 175 an onset between them collides in every run before anything is heard."""
@@ -141,11 +143,11 @@ def test_a_late_change_of_the_leader_is_not_predicted():
 def test_the_belief_rolls_back_to_the_last_challenge_that_passed():
     """From detection on it is that of a filter that saw nothing since, with the odometry replayed; before, one that saw all readings."""
     spy = Spy(make("defence", "cra", probability=0.2, watch=1.0, quiet=1))
-    trace = played(spy, "radar_jam:start_step=60,length=30", 12, place_of(horizon=120), terminate=False)
+    trace = played(spy, "radar_jam:start_step=60,length=30", 5, place_of(horizon=120), terminate=False)
     model = place_of().brief().model
     filter_ = make("filter", "joint_rls")
     plan, compared = filter_.prepare(model), np.zeros(2, int)
-    for b in range(12):
+    for b in range(5):
         alone = lambda leaf, b=b: leaf[b : b + 1]  # noqa: E731
         start = filter_.start(plan, Prior(*map(alone, spy.prior)))
         belief, safe, alarmed = start, start, False
@@ -258,8 +260,8 @@ def test_the_watch_and_the_list():
     quiet = played(f"{FIXED},times=[2,7,300]", "none", 3)
     assert (np.flatnonzero(~quiet.valid[:, 0, 0, 0]) + 1).tolist() == [2, 7, 300]
     for watch, share in (("none", 0.0), ("0.0", 0.0), ("0.3", 0.3), ("1.0", 1.0)):
-        trace = played(f"{FIXED},times=[20],watch={watch}", "radar_jam:start_step=20,length=70", 100, place_of(horizon=90), terminate=False)
-        held = ~trace.probe[20:88]
+        trace = played(f"{FIXED},times=[20],watch={watch}", "radar_jam:start_step=20,length=30", 100, place_of(horizon=50), terminate=False)
+        held = ~trace.probe[20:48]
         assert abs(held.mean() - share) <= 3.29 * np.sqrt(share * (1 - share) / held.size)
     trace = played("cra:watch=none", "radar_jam:start_step=5", 200, place_of(horizon=90), terminate=False)
     assert (~trace.probe[40:]).mean() == pytest.approx(0.1, abs=0.01) and trace.alarm[40:].mean() > 0.95
@@ -320,7 +322,7 @@ def test_looking_ahead_shows_what_a_step_does():
                 assert (moved[dead] == 0.0).all() and dead.any() == (not trace.probe[k - 1].all() or (k == 33 and text[:3] == "cra"))
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("text", ["cra", FIXED, "cra:filter=kf,suspicion=20", "cra:filter=polynomial", "cra:filter=autoregressive", "pycra", "algorithm2"])
 def test_rows_do_not_depend_on_their_batch(text):
     """trace_hash of a seed is the same alone and among others, under attack, alarm and roll-back."""

@@ -197,19 +197,18 @@ def test_a_defence_whose_rows_depend_on_one_another_is_warned_of(batch: str, tmp
     assert warning.endswith("3 of 3 came out otherwise in another batch") and len((tmp_path / "rows.jsonl").read_text().splitlines()) == 12
 
 
-def test_a_failing_component_is_exit_code_1_and_its_rows_say_why(tmp_path: Path) -> None:
+def test_a_failing_component_is_exit_code_1_and_its_rows_say_why(tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "bad.py").write_text(
         "class Bad:\n    def prepare(self, model):\n        raise RuntimeError('out of order')\n    def start(self): ...\n    def step(self, plan, state, received, known_u, draws): ...\n"
     )
-    command = (
-        sys.executable, "-m", "tailgate", "evaluate", "--scenario", "gusty-stop-and-go-v0", "--defence", "kf", "--defence", "bad:Bad",
-        "--attack", "none", "--seeds", "2", "--out", "rows.jsonl",
-    )  # fmt: skip
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 1, done.stderr
+    code, _, said = run(
+        "evaluate", "--scenario", "thesis-ch4-v0", "--defence", "kf", "--defence", "bad:Bad", "--attack", "none", "--seeds", "2", "--out", "rows.jsonl"
+    )
+    assert code == 1, said
     rows = [json.loads(line) for line in (tmp_path / "rows.jsonl").read_text().splitlines()]
     assert [row["status"] for row in rows] == ["ok", "ok", "error", "error"] and "out of order" in rows[-1]["reason"]
-    assert "2 of 4 rows failed" in done.stderr
+    assert "2 of 4 rows failed" in said
 
 
 @pytest.mark.parametrize(
@@ -258,10 +257,10 @@ def test_a_run_is_compared_also_where_nobody_can_look_into_the_defence(run: Run)
 
 def test_python_runs_the_package_as_the_command(tmp_path: Path) -> None:
     """With two workers, which are spawned: they import the main module anew, and must not run it."""
-    command = [sys.executable, "-m", "tailgate", "evaluate", "--suite", "quick-v0", "--defence", "none", "--attack", "none", "--attack", "dos_jam:start_step=200", "--seeds", "1", "--workers", "2", "--json"]
+    command = [sys.executable, "-m", "tailgate", "evaluate", "--scenario", "thesis-ch4-v0", "--defence", "kf", "--attack", "none", "--attack", "fdi", "--seeds", "1", "--workers", "2", "--json"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert {row["defence"] for row in json.loads(done.stdout)} == {"none"}
+    assert {row["defence"] for row in json.loads(done.stdout)} == {"kf"}
     refused = subprocess.run([*command[:4], "--suite", "none-v0"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert refused.returncode == 2 and refused.stderr.startswith("tailgate: error: ")
 

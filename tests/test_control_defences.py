@@ -208,7 +208,7 @@ def test_the_command_stays_within_the_bound_of_the_own_law(sides):
     clip = InputClip(sides=sides)
     bound = clip.bound(MODEL)
     for lie in (LIE, LIE.replace("=10", "=-10")):
-        trace = play(guarded(clip), lie, seeds=range(2))
+        trace = play(guarded(clip), lie, seeds=range(2), changes={"horizon": 150})
         u, own = trace.control[:, :, 1:, 0], baseline(clip, trace.wires[:, :, 1:, :3])
         assert (u <= np.clip(own + bound, -8.0, 3.0) + 1e-9).all()
         assert (u < np.clip(own - bound, -8.0, 3.0) - 1e-9).any() == (sides == "above" and lie != LIE)
@@ -256,7 +256,7 @@ def test_sliding_mode_acts_while_alarmed_and_lingers():
 
 def test_without_an_alarm_sliding_mode_changes_nothing(same_bits):
     """A detector that never alarms leaves every bit of the plain filter's episode."""
-    plain, guard = (play(guarded(m), seeds=range(3)) for m in (make("mitigation", "accept_all"), SlidingMode()))
+    plain, guard = (play(guarded(m), seeds=range(3), changes={"horizon": 60}) for m in (make("mitigation", "accept_all"), SlidingMode()))
     assert all(same_bits(plain.signals[name], guard.signals[name]) for name in plain.signals)
 
 
@@ -330,7 +330,7 @@ def test_rows_do_not_depend_on_their_batch(mitigation):
     place = {"kinds": ("fdi", "dropout"), "targets": (*OWN, "predecessor_acceleration"), "onset": 5}
     detector = make("detector", "chi2", eta=9.0)
     for attack in ("fdi_gaussian:sd=5", "dropout:probability=0.4"):
-        traces = [play(guarded(mitigation, detector), attack, seeds=seeds, changes={"horizon": 60}, **place) for seeds in (range(7), [5, 2], [3])]
+        traces = [play(guarded(mitigation, detector), attack, seeds=seeds, changes={"horizon": 30}, **place) for seeds in (range(7), [5, 2], [3])]
         known = [traces[0].trace_hash(i) for i in range(7)]
         assert [traces[1].trace_hash(0), traces[1].trace_hash(1), traces[2].trace_hash(0)] == [known[5], known[2], known[3]]
 

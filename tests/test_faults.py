@@ -52,15 +52,19 @@ def kill_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], list[str]
     return set_up
 
 
+@pytest.fixture(scope="module")
+def made() -> dict[str, list[dict[str, Any]]]:
+    return {cell.attack: run_cell(cell) for cell in cells_of(SUITE)}
+
+
 @pytest.fixture
-def played(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def played(monkeypatch: pytest.MonkeyPatch, made: dict[str, list[dict[str, Any]]]) -> list[str]:
     """The attacks of the cells that were played; their rows were made once."""
-    rows = {cell.attack: run_cell(cell) for cell in cells_of(SUITE)}
     names: list[str] = []
 
     def quick(cell: Cell) -> list[dict[str, Any]]:
         names.append(cell.attack)
-        return rows[cell.attack]
+        return [dict(row) for row in made[cell.attack]]
 
     monkeypatch.setattr(evaluation, "run_cell", quick)
     return names
@@ -192,7 +196,7 @@ def _all_die(job: str, folder: Path, every: int = 1) -> int:
     return last
 
 
-@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.long), 15])
+@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.long), 22])
 def test_a_board_that_is_killed_at_any_step_is_made_whole_by_the_same_command(tmp_path: Path, every: int) -> None:
     """Packed rows, board.json and run.json: dead at a call of the hook, nothing broken lies there, and a rerun gives the same rows and board."""
     (tmp_path / dying.NAME).write_text(dying.FILE)
@@ -225,7 +229,7 @@ def test_a_list_of_attacks_survives_every_kill(tmp_path: Path, kill_at: Any) -> 
     assert held[-1] == f"fdi:value={at}" and at > 3
 
 
-@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.long), 3])
+@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.long), 5])
 def test_a_process_that_dies_at_any_step_leaves_nothing_broken(tmp_path: Path, every: int) -> None:
     """os._exit at a call of the hook: nothing is tidied up, and the rerun still gives the same bytes and leaves no temporary file."""
     last = _all_die("rows", tmp_path, every)

@@ -1,6 +1,7 @@
 """Car following: the plant against its continuous model, the closed loop's steady states, the leader's manoeuvres."""
 
 import dataclasses
+import functools
 import itertools
 import math
 
@@ -32,8 +33,13 @@ def prepared(plant):
     return plant.prepare(plant.model(Odometry(), AdaptiveCruise()))
 
 
+@functools.cache
+def _keys(batch):
+    return keys("train", range(batch))  # a hash of each: dearer than the step of a plant
+
+
 def _draws(role, step, batch=1):
-    return keys("train", range(batch)).at(role, np.full(batch, step))
+    return _keys(batch).at(role, np.full(batch, step))
 
 
 def _noise_free(manoeuvre=None, horizon=1500, onset=1, **plant):
@@ -134,7 +140,7 @@ def test_speeds_are_never_negative_with_noise():
         assert trace.signals[name].min() == 0.0, name
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(9)
 @pytest.mark.parametrize("name, defence", LONG)
 def test_nobody_collides_without_an_attack(name, defence):
     """200 clean episodes: neither the car nor the driver behind it."""

@@ -29,10 +29,16 @@ def _scored(suite: Path, out: Path) -> Data:
     return held
 
 
+@pytest.fixture(scope="module")
+def rows(tmp_path_factory: pytest.TempPathFactory) -> list[Data]:
+    file = tmp_path_factory.mktemp("suite") / "small-v0.yaml"
+    file.write_text(TEXT)
+    return run(cells_of(load_suite(str(file))))
+
+
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path: Path, rows: list[Data]) -> Path:
     (tmp_path / "small-v0.yaml").write_text(TEXT)
-    rows = run(cells_of(load_suite(str(tmp_path / "small-v0.yaml"))))
     (tmp_path / "small-v0").mkdir()
     (tmp_path / "small-v0" / "rows.jsonl").write_bytes(encode(rows))
     return tmp_path
@@ -55,15 +61,15 @@ def test_scoring_again_keeps_what_rows_do_not_decide(folder: Path, board: Data) 
     assert _scored(folder / "small-v0.yaml", folder) == board
 
 
-def test_of_an_entry_whose_cells_changed_nothing_is_kept(folder: Path, board: Data) -> None:
+def test_of_an_entry_whose_cells_changed_nothing_is_kept(folder: Path, board: Data, rows: list[Data]) -> None:
     """Of those whose cells only became more, all is, and the number of cells is told."""
     suite = load_suite(str(folder / "small-v0.yaml"))
-    rows = run(cells_of(suite))
-    for row in rows:
+    changed = [dict(row) for row in rows]
+    for row in changed:
         if row["defence"] == "kf" and row["seed"] == 0:
             row["decision_hash"] = row["decision_hash"][::-1]
     more = run(cells_of(dataclasses.replace(suite, defences=("chi2_kf",), attacks=("dropout",))))
-    (folder / "small-v0" / "rows.jsonl").write_bytes(encode([*rows, *more]))
+    (folder / "small-v0" / "rows.jsonl").write_bytes(encode([*changed, *more]))
     again = _scored(folder / "small-v0.yaml", folder)
     entries = {entry["defence"]: entry for entry in again["entries"]}
     assert "checked" not in entries["kf"] and entries["none"]["checked"] == CHECKED

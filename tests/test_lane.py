@@ -140,6 +140,7 @@ def test_a_road_winds_to_both_sides_within_its_radius():
     assert (np.abs(seen) < 1e-9).mean() > 0.2 and (np.abs(seen) > 1 / 800 - 1e-9).mean() > 0.3
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize(("defence", "attack"), [("kf", "fdi:value=0.5"), ("chi2_kf", "stealth"), ("rkf", "dos_hold"), ("imm", "dos_jam")])
 def test_the_compiled_loop_has_the_bits_of_the_plain_one(defence, attack):
     trace_as_plain(*loop_of(NAME, defence, attack))

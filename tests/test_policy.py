@@ -27,12 +27,12 @@ from tailgate.play.metrics import METRICS, crashed
 from tailgate.play.trace import Recorder, rollout, signals_of
 from tailgate.studies.timing import timing_advantage
 
-THREAT = {"budget": 20, "kinds": ["dos_jam", "fdi"], "fdi_bound": 5.0}
+THREAT = {"onset": 10, "budget": 20, "kinds": ["dos_jam", "fdi"], "fdi_bound": 5.0}
 SEEDS = list(range(12))
 
 
 MANY: dict[str, dict[str, Any]] = {  # several agents: the scenario, and the environment's other arguments
-    "platoon-braking-v0": {"defence": "lasso_dkf", "threat": {"budget": 60, "targets": ["distance"], "agents": [1, 3]}},
+    "platoon-braking-v0": {"defence": "lasso_dkf", "threat": {"onset": 10, "budget": 60, "targets": ["distance"], "agents": [1, 3]}},
     "thesis-ch5-v0": {"defence": "norm_resilient", "threat": {"budget": 20}, "reward": "error"},
 }
 
@@ -82,7 +82,7 @@ def _same_trace(tmp_path: Path, spec: dict[str, Any], knowledge: str, scenario: 
     path = _policy(tmp_path, spec, knowledge, scenario=scenario, frames=arguments.get("frames", 1))
     _, network = load_policy(path)
     env = AdversaryVectorEnv(len(SEEDS), scenario=scenario, knowledge=knowledge, autoreset="disabled", engine="plain", **arguments, **spec)
-    loop, interval = dataclasses.replace(env.seat.loop, horizon=min(400, env.seat.loop.horizon)), spec["interval"]
+    loop, interval = dataclasses.replace(env.seat.loop, horizon=min(100, env.seat.loop.horizon)), spec["interval"]
     env.seat = env.episodes.seat = dataclasses.replace(env.seat, loop=loop)
     played = rollout(loop, PolicyAttack(path), draws.keys("train", SEEDS))
 
@@ -111,7 +111,7 @@ def _same_trace(tmp_path: Path, spec: dict[str, Any], knowledge: str, scenario: 
 @pytest.mark.parametrize("action", ["mode", "increment"])
 def test_a_stochastic_policy_repeats_whatever_the_batch(tmp_path: Path, action: str) -> None:
     path = _policy(tmp_path, {"action": action})
-    loop = _place("black").loop(Spec("defence", "kf").make())
+    loop = dataclasses.replace(_place("black"), horizon=100).loop(Spec("defence", "kf").make())
     together = rollout(loop, PolicyAttack(path, stochastic=True), draws.keys("report", SEEDS))
     alone = [rollout(loop, PolicyAttack(path, stochastic=True), draws.keys("report", [s])).trace_hash(0) for s in SEEDS[:4]]
     assert [together.trace_hash(i) for i in range(4)] == alone
@@ -130,7 +130,7 @@ def test_what_is_saved_is_what_is_loaded(tmp_path: Path) -> None:
 
 def test_a_yoked_policy_attacks_exactly_when_its_schedule_says(tmp_path: Path) -> None:
     path = _policy(tmp_path, {"action": "mode", "interval": 2})
-    loop = _place("black").loop(Spec("defence", "kf").make())
+    loop = dataclasses.replace(_place("black"), horizon=220).loop(Spec("defence", "kf").make())
     schedule = np.zeros((loop.horizon, len(SEEDS)), bool)
     for row in range(len(SEEDS)):
         schedule[100 + 10 * row : 105 + 10 * row, row] = True

@@ -22,7 +22,7 @@ from tailgate.evaluation import cells as evaluation
 from tailgate.evaluation.attack_list import attacks_of
 from tailgate.site.build import build_site
 
-SUITE = "name: mine\nscenarios: [gusty-stop-and-go-v0]\ndoses: [12]\ndefences: [none, kf]\nattacks: [none, dropout, 'fdi:value=5']\nseeds: 3\n"
+SUITE = "name: mine\nscenarios: [thesis-ch4-v0]\ndoses: [12]\ndefences: [none, kf]\nattacks: [none, dropout, 'fdi:value=5']\nseeds: 3\n"
 
 
 @pytest.fixture

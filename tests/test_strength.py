@@ -1,5 +1,6 @@
 """Measures of strength: twins of a schedule, monotone curves and critical doses; pictures and commands of all."""
 
+import functools
 import importlib.util
 import json
 import math
@@ -16,6 +17,7 @@ from tailgate.base.errors import InputError
 from tailgate.core import draws
 from tailgate.core.draws import Role
 from tailgate.core.registry import Spec
+from tailgate.evaluation.stats import paired_difference
 from tailgate.play.metrics import METRICS
 from tailgate.play.trace import MEMORY, Trace, episodes_at_once, rollout
 from tailgate.studies.collect import add_run
@@ -30,7 +32,20 @@ assert spec is not None and spec.loader is not None
 strong = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(strong)
 PLACE, THREAT, ZOO, _always, _recorded = strong.PLACE, strong.THREAT, strong.ZOO, strong.always, strong.recorded
-brief_place, half_place = strong.brief_place, strong.half_place
+half_place = strong.half_place
+
+
+@pytest.fixture(scope="module")
+def brief_place(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The scenario cut to 32 steps, attacked from step 10 on: a budget of 20 is spent within it."""
+    return str(strong.cut(tmp_path_factory.mktemp("scenario"), 32, onset=10))
+
+
+@pytest.fixture(autouse=True)
+def few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Intervals of reports from 100 resamples; test_stats has the intervals themselves."""
+    for module in ("timing", "policies"):
+        monkeypatch.setattr(f"tailgate.studies.{module}.paired_difference", functools.partial(paired_difference, resamples=100))
 
 
 # -- twins of a schedule
@@ -117,9 +132,9 @@ def test_what_a_file_does_not_say_has_to_be_said(tmp_path: Path, brief_place: st
 
 
 def test_many_episodes_are_played_as_memory_allows(monkeypatch: pytest.MonkeyPatch, half_place: str) -> None:
-    """The timing advantage of 17 episodes, seven at a time, is that of all at once to the bit: each has the times of the one before it."""
+    """The timing advantage of 10 episodes, seven at a time, is that of all at once to the bit: each has the times of the one before it."""
     who = trained(ZOO)
-    loop, keys = loop_for(who, half_place, "chi2_kf", THREAT), draws.keys("report", range(17))
+    loop, keys = loop_for(who, half_place, "chi2_kf", THREAT), draws.keys("report", range(10))
     record = rollout(loop, who.policy, keys, terminate=False).kind != 0
     twin = Yoked(who.policy, np.roll(record, 1, axis=1))
     together = [METRICS["min_gap"](rollout(loop, attack, keys)) for attack in (who.policy, twin)]
@@ -132,7 +147,7 @@ def test_many_episodes_are_played_as_memory_allows(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("tailgate.studies.timing.rollout", counted)
     monkeypatch.setattr("tailgate.play.trace.MEMORY", 7.5 * MEMORY / episodes_at_once(loop.model, loop.horizon, 10**9))
     apart = timing_advantage(loop, who.policy, keys, "min_gap")
-    assert sizes == [7, 7, 3] * 3
+    assert sizes == [7, 3] * 3
     assert np.array_equal(apart, together) and not np.array_equal(*apart)
     played = play(loop, who.policy, keys, "min_gap")
     assert np.array_equal([played.outcome["own"], played.outcome["yoked"]], together)
@@ -221,7 +236,7 @@ def test_the_bootstrap_interval_covers_the_critical_dose() -> None:
     hits = 0
     import tailgate.studies.dose as module
 
-    before, module.RESAMPLES = module.RESAMPLES, 200
+    before, module.RESAMPLES = module.RESAMPLES, 100
     try:
         for _ in range(200):
             low, high = critical_interval(doses, (rng.random((3, 150)) < shares[:, None]).astype(float), 0.1)
@@ -247,9 +262,9 @@ def test_dose_response_of_a_scripted_attack(tmp_path: Path) -> None:
     assert dose_figure(report)[:4] == b"\x89PNG"
 
 
-def test_a_dose_response_of_an_error_counts_episodes_above_a_bound() -> None:
+def test_a_dose_response_of_an_error_counts_episodes_above_a_bound(tmp_path: Path) -> None:
     """Without a road: the mean has no critical dose until a limit is named, the share above a bound has one of 10 %."""
-    arguments: dict[str, Any] = {"episodes": 6, "threat": {"kinds": ["fdi"], "fdi_bound": 100.0}}
+    arguments: dict[str, Any] = {"episodes": 6, "threat": {"kinds": ["fdi"], "fdi_bound": 100.0}, "rows_file": tmp_path / "rows.jsonl"}
     plain = dose_response(["fdi:value=100"], ["norm_resilient"], "thesis-ch5-v0", [10], **arguments)
     assert plain["outcome"] == "rmse_position" and plain["limit"] is None and "critical_dose" not in plain["curves"][0]
     clean, attacked = (point["value"] for point in plain["curves"][0]["points"])
@@ -309,18 +324,15 @@ def test_the_commands_write_reports_and_pictures(
         "dose-response": ["dose-response", script, "--defence", "kf", "--scenario", brief_place, "--doses", "5,10", "--episodes", "4", *grants],
         "transfer": ["transfer", policy, "--scenario", brief_place, "--defence", "kf", "--episodes", "4"],
     }
+    shown = {"timing": "yoked", "dose-response": "critical dose", "transfer": "on kf"}
     for name, words in commands.items():
         assert cli.main([*words, "--out", "out", "--json"]) == 0
         assert json.loads(capsys.readouterr().out) == json.loads((tmp_path / "out" / f"{name}.json").read_text())
         assert (tmp_path / "out" / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
         assert cli.main([*words, "--out", "vectors", "--picture", "pdf"]) == 0
-        assert (tmp_path / "vectors" / f"{name}.pdf").read_bytes()[:4] == b"%PDF" and not capsys.readouterr().out.startswith("{")
-    assert cli.main(commands["timing"]) == 0
-    assert "yoked" in capsys.readouterr().out
-    assert cli.main(commands["transfer"]) == 0
-    assert "on kf" in capsys.readouterr().out
-    assert cli.main(commands["dose-response"]) == 0
-    assert "critical dose" in capsys.readouterr().out
+        assert (tmp_path / "vectors" / f"{name}.pdf").read_bytes()[:4] == b"%PDF"
+        said = capsys.readouterr().out
+        assert not said.startswith("{") and shown[name] in said
     assert cli.main(["dose-response", "none", "--defence", "kf", "--scenario", PLACE, "--doses", "5;10"]) == 2
     assert "--doses" in capsys.readouterr().err
 

@@ -24,13 +24,13 @@ THREAT, ZOO, _always, _recorded = strong.THREAT, strong.ZOO, strong.always, stro
 brief_place, half_place = strong.brief_place, strong.half_place
 
 
-def test_many_defences_have_a_line_each(capsys: pytest.CaptureFixture[str], tmp_path: Path, half_place: str) -> None:
+def test_many_defences_have_a_line_each(capsys: pytest.CaptureFixture[str], tmp_path: Path, brief_place: str) -> None:
     """A few of them are columns beside their intervals."""
-    policy = str(_recorded(_always(tmp_path, "policy-0"), scenario=half_place))
+    policy = str(_recorded(_always(tmp_path, "policy-0"), scenario=brief_place))
     many = ["none", "kf", "rkf", "chi2_kf", "imm", "cusum_kf", "mewma_kf", "widen_kf", "brake_kf"]
     for some, head in ((many, "played on"), (many[:2], "trained on")):
         arguments = [word for name in some for word in ("--defence", name)]
-        assert cli.main(["transfer", policy, "--scenario", half_place, "--episodes", "2", *arguments]) == 0
+        assert cli.main(["transfer", policy, "--scenario", brief_place, "--episodes", "2", *arguments]) == 0
         said = capsys.readouterr().out
         assert head in said and all(name in said for name in some)
 

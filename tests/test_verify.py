@@ -20,7 +20,7 @@ from tailgate.evaluation.rows import encode
 from tailgate.evaluation.verify import verify
 
 ATTACKS = ("none", "fdi:value=5", "dropout:probability=0.5")
-SUITE = Suite("small", "", ("thesis-ch4-v0", "thesis-ch4-literal-v0"), (5, 9), ("kf",), ATTACKS, 3)
+SUITE = Suite("small", "", ("thesis-ch4-v0", "thesis-ch4-literal-v0"), (5,), ("kf",), ATTACKS, 3)
 
 
 @pytest.fixture(scope="module")
@@ -36,14 +36,14 @@ def _one(rows: list[dict[str, Any]], **changes: Any) -> dict[str, Any]:
 
 def test_honest_rows_are_verified(rows: list[dict[str, Any]]) -> None:
     report = verify(rows)
-    assert report["status"] == "verified" and report["counts"] == {"verified": 36, "differs": 0, "unchecked": 0}
-    assert report["entries"] == [{"defence": "kf", "status": "verified", "verified": 36, "differs": 0, "unchecked": 0}]
+    assert report["status"] == "verified" and report["counts"] == {"verified": 18, "differs": 0, "unchecked": 0}
+    assert report["entries"] == [{"defence": "kf", "status": "verified", "verified": 18, "differs": 0, "unchecked": 0}]
     assert report["findings"] == [] and json.loads(json.dumps(report)) == report
 
 
 def test_rows_of_a_version_that_plays_the_same_are_verified_and_scored_with_others(rows: list[dict[str, Any]]) -> None:
-    older = [row | {"version": ALIKE[-1]} for row in rows]
-    assert verify(older)["counts"] == {"verified": 36, "differs": 0, "unchecked": 0}
+    older = [row | {"version": ALIKE[-1]} for row in rows[:9]]
+    assert verify(older)["counts"] == {"verified": 9, "differs": 0, "unchecked": 0}
     assert _one(rows, version=ALIKE[-1], min_gap=1.0)["counts"]["differs"] == 1
     assert plays_as(ALIKE[-1]) == tailgate.__version__ and plays_as("0.0.1") == "0.0.1"
 
@@ -55,8 +55,8 @@ def test_a_row_is_the_same_with_other_workers_batches_and_companions(tmp_path: P
     for workers in (1, 2):
         report = verify(held, workers=workers, batch=24)
         assert report["counts"] == {"verified": 40, "differs": 0, "unchecked": 0}, workers
-    assert verify(held[::-1][:12], batch=1)["counts"]["verified"] == 12
-    assert verify(held, sample=7, batch=4)["counts"] == {"verified": 7, "differs": 0, "unchecked": 0}
+    assert verify(held[::-1][:4], batch=1)["counts"]["verified"] == 4
+    assert verify(held, sample=4, batch=4)["counts"] == {"verified": 4, "differs": 0, "unchecked": 0}
     other = Cell(**(dataclasses.asdict(cell) | {"attack": "none", "seeds": 2}))
     real, calls = run_cell, []
 
@@ -133,6 +133,7 @@ def test_rows_of_a_radar_a_platoon_and_a_network_are_the_same_too() -> None:
     assert verify(held[::-7], batch=1)["counts"] == {"verified": 8, "differs": 0, "unchecked": 0}
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize(
     ("name", "value", "where"),
     [
@@ -234,7 +235,7 @@ def test_the_sample_is_as_large_as_asked_and_is_drawn(rows: list[dict[str, Any]]
     one, same, other = (verify(broken, sample=5, sample_seed=seed) for seed in (0, 0, 1))
     lines = [[finding["line"] for finding in report["findings"]] for report in (one, same, other)]
     assert lines[0] == lines[1] != lines[2] and [len(set(held)) for held in lines] == [5, 5, 5]
-    assert one["asked"] == 5 and one["rows"] == 36
+    assert one["asked"] == 5 and one["rows"] == 18
     with pytest.raises(tailgate.InputError, match="sample"):
         verify(rows, sample=0)
 
