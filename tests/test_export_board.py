@@ -89,7 +89,7 @@ def test_bibtex_names_the_board_and_its_version() -> None:
 
 
 @pytest.mark.thin(2)
-@pytest.mark.parametrize(("form", "start"), [("svg", b"<?xml"), ("pdf", b"%PDF")])
+@pytest.mark.parametrize(("form", "start"), [("pdf", b"%PDF"), ("svg", b"<?xml")])
 def test_pictures_are_vectors_and_repeat(form: str, start: bytes, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     board = json.loads((FILE.parents[1] / "car-following-v0" / "board.json").read_text())

@@ -50,7 +50,7 @@ def test_a_limit_of_steps_is_that_of_gymnasium(autoreset, engine):
     assert vec.spec.max_episode_steps == 7
     vec.reset(seed=20)
     rng, log = np.random.default_rng(0), []
-    for _ in range(60):
+    for _ in range(50):
         actions = rng.integers(0, vec.single_action_space.n, 3)
         log.append((actions, *vec.step(actions)))
         over = log[-1][3] | log[-1][4]
@@ -110,7 +110,8 @@ def test_information_has_one_set_of_names_and_types(name):
     pytest.importorskip("stable_baselines3")
     from tailgate.envs.gym.sb3 import BatchVecEnv
 
-    env, vec, batch = AdversaryEnv(**SYSTEMS[name]), AdversaryVectorEnv(2, **SYSTEMS[name]), BatchVecEnv(2, name, max_episode_steps=2)
+    few = SYSTEMS[name] | ({"defence": "dkf"} if name == "tailgate/SensorNetwork-v0" else {})  # its default takes long to compile
+    env, vec, batch = AdversaryEnv(**few), AdversaryVectorEnv(2, **few), BatchVecEnv(2, name, max_episode_steps=2, **few)
     _, info = env.reset(seed=0)
     _, told = vec.reset(seed=0)
     batch.reset()

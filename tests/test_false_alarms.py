@@ -58,7 +58,7 @@ def test_a_run_is_no_longer_than_asked_and_batches_change_no_figure(monkeypatch)
     horizon, dt = load_scenario(told["scenario"]).horizon, load_scenario(told["scenario"]).brief().model.dt
     whole = false_alarms(ROAD, [told], 20, 10 * horizon)
     assert [line["running"] for line in whole] == pytest.approx([10 * horizon * dt / 3600.0] * 2) and whole[1]["onsets"] > 100
-    monkeypatch.setattr(module, "BATCH", 3)
+    monkeypatch.setattr(module, "BATCH", 6)
     assert false_alarms(ROAD, [told], 20, 10 * horizon) == whole
 
 

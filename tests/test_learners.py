@@ -79,7 +79,7 @@ def earned(path: Path | None, environment: dict[str, Any], action: str) -> float
 
 
 @pytest.mark.parametrize(("name", "decisions"), [
-    ("ppo", 14_000), ("maskable_ppo", 14_000), pytest.param("recurrent_ppo", 12_000, marks=pytest.mark.long),
+    ("ppo", 14_000), pytest.param("maskable_ppo", 14_000, marks=pytest.mark.long), pytest.param("recurrent_ppo", 12_000, marks=pytest.mark.long),
     pytest.param("dqn", 24_000, marks=pytest.mark.long),
 ])  # fmt: skip
 def test_it_learns_when_to_attack(name: str, decisions: int, paid: dict[str, Any], tmp_path: Path) -> None:

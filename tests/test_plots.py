@@ -48,6 +48,7 @@ def test_the_pictures_show_the_figures():
         assert one.shape != two.shape or (one != two).any()
 
 
+@pytest.mark.thin(2)  # the other form: test_export_board
 @pytest.mark.parametrize("form, start", [("svg", b"<?xml"), ("pdf", b"%PDF")])
 def test_vectors_repeat(form, start, tmp_path):
     first, again = ([path.read_bytes() for path in write_overview(TABLE, tmp_path / name, form)] for name in "ab")

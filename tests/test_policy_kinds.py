@@ -1,5 +1,6 @@
 """Policies with memory, under masks, or squashed."""
 
+import dataclasses
 import hashlib
 import json
 from pathlib import Path
@@ -23,7 +24,7 @@ from tailgate.play.trace import rollout
 
 THREAT: dict[str, Any] = {"budget": 20, "kinds": ["dos_jam", "fdi"], "fdi_bound": 5.0}
 SEEDS = list(range(12))
-PLACE = load_scenario("gusty-stop-and-go-v0").with_threat(**THREAT, knowledge="black")
+PLACE = dataclasses.replace(load_scenario("gusty-stop-and-go-v0"), horizon=240).with_threat(**THREAT, knowledge="black")
 
 
 def _special(path: Path, kind: str, seed: int = 1) -> Path:
@@ -49,7 +50,7 @@ def test_a_policy_of_every_kind_plays_alone_as_in_company_and_steps_as_it_plays(
     together = rollout(loop, PolicyAttack(path), keys)
     assert (together.kind != 0).any() and len({together.trace_hash(i) for i in range(64)}) == 64
     assert [rollout(loop, PolicyAttack(path), draws.keys("train", [i])).trace_hash(0) for i in (0, 1, 63)] == [together.trace_hash(i) for i in (0, 1, 63)]
-    env = AdversaryVectorEnv(64, scenario="gusty-stop-and-go-v0", defence="kf", threat=THREAT, autoreset="disabled", engine="plain", action=header.action.action, interval=3)
+    env = AdversaryVectorEnv(64, scenario=PLACE, defence="kf", threat=THREAT, autoreset="disabled", engine="plain", action=header.action.action, interval=3)
     observation, _ = env.reset(seed=0)
     memory = None if network.lstm is None else network.lstm.blank(64)
     attacked = []

@@ -26,6 +26,7 @@ def played(attack, seeds=range(4), defence="none", **threat):
     return rollout(place(**threat).loop(spec.make(), spec.entry.uses), made, keys("train", list(seeds)))
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("attack, kind, value", [
     ("noise_jam:power=0.03,start_step=20,length=5", Kind.NOISE_JAM, 0.03), ("echo_delay:delay=6,start_step=20,length=5", Kind.ECHO_DELAY, 6.0),
     ("noise_jam:power=5,start_step=20,length=5", Kind.NOISE_JAM, 0.1), ("echo_delay:delay=500,start_step=20,length=5", Kind.ECHO_DELAY, 60.0),
@@ -156,7 +157,7 @@ def test_a_program_over_the_air_needs_a_radar(tmp_path):
 
 @pytest.mark.parametrize("name", ["radar-following-v0", "radar-braking-v0", "radar-fast-attacker-v0"])
 @pytest.mark.parametrize("defence", ["none", "kf", "chi2_kf", "cra"])
-@pytest.mark.thin(2)
+@pytest.mark.thin(5)
 def test_without_an_attack_everybody_arrives(name, defence):
     """200 episodes without a collision in front or behind and without a false alarm; standing, the car keeps its 5 m, the noise aside."""
     spec = Spec("defence", defence)

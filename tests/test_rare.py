@@ -106,7 +106,8 @@ def test_the_likeliest_failure_is_the_nearest():
     assert play(found.mean[None], np.zeros((1, 3), np.uint64), 0.0)[0][0] < 0.0
 
 
-@pytest.mark.parametrize("text", ["none", "dropout:chance=0.1"])
+@pytest.mark.thin(2)
+@pytest.mark.parametrize("text", ["dropout:chance=0.1", "none"])
 def test_a_branch_is_the_same_until_it_leaves(text):
     """Keys that change at a step change nothing before it; the traced loop plays what the plain loop plays."""
     case = Case("", "gusty-stop-and-go-v0", None, "chi2_kf", (), "G gap > 2", text)

@@ -156,7 +156,7 @@ def test_a_damaged_curve_is_refused(tmp_path, text):
 
 
 @pytest.mark.thin(8)
-@pytest.mark.parametrize("name", ["training preset", "rows", "compressed rows", "policy", "policy's tensors", "card", "speed profile", "formulas"])
+@pytest.mark.parametrize("name", ["rows", "training preset", "compressed rows", "policy", "policy's tensors", "card", "speed profile", "formulas"])
 def test_a_sample_of_the_campaign_ends_well(name):
     valid = valid_of(name)
     report = campaign(readers()[name], 80, 0, valid=valid)

@@ -199,9 +199,9 @@ def test_other_systems_have_a_window(name, monkeypatch):
     """Human mode shows what rgb_array returns."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     pygame = pytest.importorskip("pygame")
-    env = gymnasium.make(name, render_mode="human")
+    env = gymnasium.make(name, render_mode="human", engine="plain")
     env.unwrapped.metadata["render_fps"] = 10_000
-    twin = gymnasium.make(name, render_mode="rgb_array")
+    twin = gymnasium.make(name, render_mode="rgb_array", engine="plain")
     env.reset(seed=3), twin.reset(seed=3)
     env.step(0), twin.step(0)
     assert (np.moveaxis(pygame.surfarray.array3d(pygame.display.get_surface()), 0, 1) == twin.render()).all()

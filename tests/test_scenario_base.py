@@ -82,8 +82,8 @@ def test_a_scenario_is_a_mapping_an_object_or_a_path_too(tmp_path: Path) -> None
     rows = [tailgate.evaluate(scenarios=form, defences="kf", attacks="fdi:start_step=10,value=-3", seeds=2) for form in forms]
     assert len({row["trace_hash"] for some in rows for row in some[:1]}) == 1 and len({row["config_hash"] for some in rows for row in some}) == 1
     assert [some[0]["scenario"] for some in rows] == ["custom"] * 4 and [bool(some[0]["scenario_file"]) for some in rows] == [False, False, True, True]
-    both = tailgate.evaluate(scenarios=[FIELDS, "stop-and-go-v0"], defences="kf", attacks="none", seeds=1, workers=2)
-    assert [row["scenario"] for row in both] == ["custom", "stop-and-go-v0"] and both[0]["status"] == "ok"
+    both = tailgate.evaluate(scenarios=[FIELDS, "thesis-ch4-v0"], defences="kf", attacks="none", seeds=1, workers=2)
+    assert [row["scenario"] for row in both] == ["custom", "thesis-ch4-v0"] and both[0]["status"] == "ok"
     seen = []
     for form in forms:
         env = gymnasium.make("tailgate:tailgate/CarFollowing-v1", scenario=form, value=-3.0)

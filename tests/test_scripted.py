@@ -59,7 +59,7 @@ def test_bursts_and_pauses(sends):
 def test_signs_are_the_wires_own(sends):
     """With `signs` each wire has its own sign, the same in every step and episode; two seeds differ, without it all are alike."""
     seen = {}
-    for seed in (None, *range(12)):
+    for seed in (None, *range(8)):
         value = sends("fdi", value=4.0, signs=seed, threat={"fdi_bound": 5.0}).value[:, :, 0, :2]
         assert (np.abs(value) == 4.0).all() and (value == value[0, 0]).all()
         seen[seed] = tuple(np.sign(value[0, 0]).tolist())
@@ -274,6 +274,7 @@ def test_actuator_injection_has_no_other_targets(short):
         tailgate.make_attack("actuator_fdi", targets=("position",)).prepare(short().brief())
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("name, targets", [("delay", ()), ("replay", ()), ("actuator_fdi", ("acceleration",)), ("fdi_sparse", ()), ("fdi_uniform", ())])
 def test_rows_do_not_depend_on_their_batch(name, targets, short, loop_of):
     """With what they need granted: alone, among 3 or among 16; budget and cooldown hold; before the onset nothing differs."""

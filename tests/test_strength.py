@@ -265,13 +265,13 @@ def test_dose_response_of_a_scripted_attack(tmp_path: Path) -> None:
 def test_a_dose_response_of_an_error_counts_episodes_above_a_bound(tmp_path: Path) -> None:
     """Without a road: the mean has no critical dose until a limit is named, the share above a bound has one of 10 %."""
     arguments: dict[str, Any] = {"episodes": 6, "threat": {"kinds": ["fdi"], "fdi_bound": 100.0}, "rows_file": tmp_path / "rows.jsonl"}
-    plain = dose_response(["fdi:value=100"], ["norm_resilient"], "thesis-ch5-v0", [10], **arguments)
+    plain = dose_response(["fdi:value=100"], ["dkf"], "thesis-ch5-v0", [10], **arguments)
     assert plain["outcome"] == "rmse_position" and plain["limit"] is None and "critical_dose" not in plain["curves"][0]
     clean, attacked = (point["value"] for point in plain["curves"][0]["points"])
     assert attacked > clean > 0.0
-    shares = dose_response(["fdi:value=100"], ["norm_resilient"], "thesis-ch5-v0", [10], outcome="max_error", exceeds=0.0, **arguments)
+    shares = dose_response(["fdi:value=100"], ["dkf"], "thesis-ch5-v0", [10], outcome="max_error", exceeds=0.0, **arguments)
     assert shares["unit"] == "0/1" and shares["curves"][0]["critical_dose"]["value"] == 0.0  # every error is above 0
-    never = dose_response(["fdi:value=100"], ["norm_resilient"], "thesis-ch5-v0", [10], outcome="max_error", exceeds=1e9, **arguments)
+    never = dose_response(["fdi:value=100"], ["dkf"], "thesis-ch5-v0", [10], outcome="max_error", exceeds=1e9, **arguments)
     assert never["curves"][0]["critical_dose"] == {"value": None, "low": None, "high": None}
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -121,11 +122,16 @@ def test_a_report_that_is_none_is_named(rows: list[dict[str, Any]], tmp_path: Pa
         board_of(SUITE, tmp_path, require_adaptive=False)
 
 
+@functools.cache
+def _published(name: str) -> Any:
+    return load(board_in(ROOT / f"results/{name}"))
+
+
 @pytest.mark.parametrize("name", BOARDS)
 def test_a_published_board_is_of_the_suite_that_is_here(name: str) -> None:
     """A suite that changed leaves its board behind until its rows are played again."""
     assert name in list_suites()
-    board = load(board_in(ROOT / f"results/{name}"))
+    board = _published(name)
     assert board["suite"]["hash"] == load_suite(name).hash
     for entry in read_board(board).entries:
         again = entry.checked
@@ -135,7 +141,7 @@ def test_a_published_board_is_of_the_suite_that_is_here(name: str) -> None:
 @pytest.mark.parametrize("name", BOARDS)
 def test_no_figure_of_a_published_board_rests_on_a_policy_that_is_not_here(name: str) -> None:
     """The worst of rates, critical doses and robustness rows, and worst episodes, can be played by whoever clones."""
-    board = load(board_in(ROOT / f"results/{name}"))
+    board = _published(name)
     named = set()
     for entry in board["entries"]:
         worst = [*entry["rates"], *(dose for dose in entry["critical_dose"].values() if dose), *entry["robustness"]]

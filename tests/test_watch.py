@@ -31,7 +31,8 @@ CASES = [
 
 
 def _played(scenario: str, guard: object, uses: tuple[str, ...], attack: str, *, plain: bool = False) -> Trace:
-    loop = load_scenario(scenario).with_threat(budget=20).loop(guard, uses)
+    place = load_scenario(scenario).with_threat(budget=20)
+    loop = dataclasses.replace(place, horizon=min(place.horizon, 150)).loop(guard, uses)
     return rollout(loop, Spec("attack", attack).make(), keys("tune", range(6)), plain=plain)
 
 
