@@ -35,6 +35,7 @@ def hit(trace):
     return trace.target.any(axis=3)
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("agents", [(4,), (0, 9), (2, 3, 7)])
 def test_a_script_hits_the_agents_that_it_names(agents, sends):
     """Those and no others; what all others sent arrives, bit for bit."""
@@ -198,7 +199,7 @@ GUARDS = ["chi2_dkf", "chi2_dkf:gain=steady", "chi2_kf", "composed:filter=dkf,de
 @pytest.mark.parametrize("defence", GUARDS)
 @pytest.mark.parametrize("scenario, index, least", [("platoon-braking-v0", 0, 0.5), ("platoon-braking-v0", 1, 0.3), ("thesis-ch5-v0", 3, 0.5)])
 @pytest.mark.parametrize("sign", [-1, 1])
-@pytest.mark.thin(3)
+@pytest.mark.thin(7)
 def test_stealth_pushes_each_agent_up_to_its_own_gate(defence, scenario, index, least, sign, short, play):
     """Every attacked agent is moved in the wanted sense by more than noise would, and never alarms in an attacked step."""
     agents = (1, 3) if scenario == "platoon-braking-v0" else (0, 4, 7)

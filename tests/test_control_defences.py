@@ -218,7 +218,7 @@ def test_the_command_stays_within_the_bound_of_the_own_law(sides):
 
 def test_one_side_does_not_follow_false_readings():
     """A false gap of +60 m on the own sensor: with a lower bound too the car is driven into the one ahead, whatever the filter knows."""
-    options = {"attack": "fdi:value=60,targets=[distance],chance=0.9", "place": "platoon-braking-v0"}
+    options = {"attack": "fdi:value=60,targets=[distance],chance=0.9", "place": "platoon-braking-v0", "onset": 20, "changes": {"horizon": 250}}
     lasso = make("filter", "lasso")
     above, both = (play(guarded(InputClip(sides=sides), filter=lasso), **options, seeds=range(4)) for sides in ("above", "both"))
     assert not above.collided.any() and both.collided.any()
@@ -228,7 +228,7 @@ def test_sliding_mode_keeps_to_its_surface_and_out_of_collision():
     """Without noise |sigma| <= phi, but for what the gap's rate lags behind, in hard braking, whatever the messages say; the cars stop apart."""
     still = {"sensor": make("sensor", "platoon_sensors", noise_sd=(0.0, 0.0, 0.0), told_sd=(0.1, 0.1, 0.05))}
     slide = SlidingMode(when="always", smoothing=0.1)
-    trace = play(guarded(slide), LIE, seeds=range(2), changes=still | {"manoeuvre": make("manoeuvre", "braking", onset=(10.0, 12.0), decel=7.5)})
+    trace = play(guarded(slide), LIE, seeds=range(2), changes=still | {"manoeuvre": make("manoeuvre", "braking", onset=(10.0, 12.0), decel=7.5), "horizon": 250})
     assert not trace.collided.any() and trace.gap[:, :, 1:].min() > 4.5
     X = trace.truth[:, :, 0]
     for i in (1, 2, 3, 4):

@@ -30,7 +30,7 @@ SURE = (1e-9, 1e-9, 1e-9)
 def quiet(value=0.0, **threat):
     """The scenario without noise, which its defence is still told: a straight road, or one with a bend that does not end."""
     return dataclasses.replace(
-        load_scenario(NAME), horizon=300, truth={"plant": QUIET, "sensor": {"noise_sd": SURE}},
+        load_scenario(NAME), horizon=299, truth={"plant": QUIET, "sensor": {"noise_sd": SURE}},
         manoeuvre=make("manoeuvre", "bend", value=value, begin=0.0),
     ).with_threat(**threat)
 

@@ -365,7 +365,7 @@ def test_a_linear_filter_does_not_reverse_a_car_that_the_brake_holds():
 
 def test_a_platoon_brakes_on_its_own_gap_and_speed():
     """The second car's gap, falsified by much while the car ahead brakes, would make it collide as it does undefended."""
-    place = dataclasses.replace(load_scenario("platoon-gusty-v0"), horizon=320).with_threat(targets=("distance",))
+    place = dataclasses.replace(load_scenario("platoon-gusty-v0"), horizon=299).with_threat(targets=("distance",))
     attack = "fdi:trigger=near,threshold=20,value=20,length=60"
     traces = [played(place, name, attack, 3) for name in ("none", "safe_state_brake")]
     assert struck(traces[0]).mean() > 0.9 and not struck(traces[1]).any()
