@@ -82,7 +82,7 @@ def _same_trace(tmp_path: Path, spec: dict[str, Any], knowledge: str, scenario: 
     path = _policy(tmp_path, spec, knowledge, scenario=scenario, frames=arguments.get("frames", 1))
     _, network = load_policy(path)
     env = AdversaryVectorEnv(len(SEEDS), scenario=scenario, knowledge=knowledge, autoreset="disabled", engine="plain", **arguments, **spec)
-    loop, interval = dataclasses.replace(env.seat.loop, horizon=min(100 if scenario in MANY else 250, env.seat.loop.horizon)), spec["interval"]
+    loop, interval = dataclasses.replace(env.seat.loop, horizon=min(100 if scenario in MANY else 299, env.seat.loop.horizon)), spec["interval"]
     env.seat = env.episodes.seat = dataclasses.replace(env.seat, loop=loop)
     played = rollout(loop, PolicyAttack(path), draws.keys("train", SEEDS))
 

@@ -153,7 +153,7 @@ def test_rows_depend_on_nothing_but_their_seeds(found: Found, short: str) -> Non
 def test_an_interrupted_run_goes_on_where_it_was(found: Found, short: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Finished cells would be played again, or the result would differ from that of a run in peace."""
     played: list[str] = []
-    made = {job.identity: row for job, row in zip(jobs_of(_suite(short)), _rows(found[1]), strict=True)}
+    made = {job.identity: row for job, row in zip(jobs_of(_suite(short), runs=N), _rows(found[1]), strict=True)}
 
     def once(job: Job) -> dict[str, Any]:
         played.append(job.identity)

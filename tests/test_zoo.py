@@ -53,6 +53,7 @@ def test_every_policy_has_its_record_and_is_small(name: str) -> None:
     assert {path.stem for path in zoo.FOLDER.glob("*.safetensors")} == set(zoo_names())
 
 
+@pytest.mark.thin(3)  # policies of one search have one environment
 @pytest.mark.parametrize("name", zoo_names())
 def test_the_recorded_environment_is_that_of_its_record(name: str) -> None:
     """The hash is that of the environment which the training's configuration makes today: it can be trained again as it was."""
