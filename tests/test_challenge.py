@@ -43,10 +43,10 @@ def place_of(name="thesis-ch3-v0", **changes):
     return dataclasses.replace(load_scenario(name), **changes)
 
 
-def played(defence, attack, seeds=40, place=None, **options):
+def played(defence, attack, seeds=200, place=None, **options):
     spec = Spec("defence", defence) if isinstance(defence, str) else None
     made, uses = (spec.make(), spec.entry.uses) if spec else (defence, ("measurements", "odometry", "probe"))
-    loop = (place or place_of(horizon=299)).loop(made, uses)  # a step less than what is traced
+    loop = (place or place_of()).loop(made, uses)
     return rollout(loop, Spec("attack", attack).make(), keys("report", range(seeds)), **options)
 
 
@@ -72,7 +72,7 @@ def onset_of(trace):
 @pytest.mark.parametrize("attack", [JAM, LATE])
 def test_scenario_one_is_survived_with_the_joint_regression(attack):
     """Both attacks are detected at 182, no run collides, the gap's error over the attack is about 0.14 m, and the last gap 5.03 m."""
-    trace = played(FIXED, attack, 200, place_of())
+    trace = played(FIXED, attack)
     assert not crashed(trace).any() and (onset_of(trace) == 182).all()
     assert np.median(error_of(trace, 182)) == pytest.approx(0.14, abs=0.03)
     assert np.median(trace.gap[-1]) == pytest.approx(5.03, abs=0.01)
@@ -105,7 +105,7 @@ def test_a_list_that_the_attacker_knows_loses(onset):
 
 def test_random_challenges_lose_to_the_thesis_jammer_only_where_they_come_late():
     """With p = 0.1 it takes 9 steps on average, and a reading of 180 m and more is fatal after some 6: those who challenge sooner survive."""
-    trace = played("cra", JAM, 200)
+    trace = played("cra", JAM)
     latency = np.where(onset_of(trace) > 0, onset_of(trace) - 182, 999)
     assert crashed(trace)[latency >= 7].all() and not crashed(trace)[latency <= 3].any()
     low, high = stats.binom.ppf([0.0005, 0.9995], 200, 0.9**6) / 200  # nothing heard in the first 6
@@ -122,7 +122,7 @@ def test_a_challenge_that_a_doubtful_reading_prompts_comes_in_time(attack):
 @pytest.mark.parametrize("at, error", [(60, 0.33), (100, 0.82)])
 def test_scenario_two_needs_the_reset(at, error):
     """A leader that changes from -0.1082 to +0.012 m/s^2 well before the attack is predicted with the reset, and not without."""
-    place = place_of("thesis-ch3-switched-v0", horizon=299)
+    place = place_of("thesis-ch3-switched-v0")
     place = dataclasses.replace(place, manoeuvre=dataclasses.replace(place.manoeuvre, at=at))
     trace = played(FIXED, JAM, place=place)
     assert np.median(error_of(trace, 182)) == pytest.approx(error, rel=0.25) and not crashed(trace).any()
@@ -131,7 +131,7 @@ def test_scenario_two_needs_the_reset(at, error):
 
 def test_a_late_change_of_the_leader_is_not_predicted():
     """25 readings since the change, up to the last challenge that passed, leave 8 m over 118 s: what least squares on them would."""
-    place = place_of("thesis-ch3-switched-v0", horizon=299)
+    place = place_of("thesis-ch3-switched-v0")
     place = dataclasses.replace(place, manoeuvre=dataclasses.replace(place.manoeuvre, at=150))
     error = np.median(error_of(played(FIXED, JAM, place=place, terminate=False), 182))
     assert 4.0 < error < 20.0
@@ -243,21 +243,21 @@ def test_false_alarms_come_as_often_as_asked_for():
 
 def test_no_false_alarm_in_the_closed_loop_at_one_in_a_million():
     """200 clean episodes with a challenge in every second step: none of 30 000 is taken for an attack, and none collides."""
-    trace = played("cra:probability=0.5", "none", 200)
+    trace = played("cra:probability=0.5", "none")
     assert np.count_nonzero(~trace.probe) > 29_000 and not trace.alarm.any() and not crashed(trace).any()
 
 
 def test_an_attacker_who_falls_silent_in_time_is_not_heard():
     """With no reaction time an attacker is never detected, and its 6 m end in a collision; with one of 0.1 s, the window, it is."""
-    place = place_of(horizon=299).with_threat(reaction=0.0)
+    place = place_of().with_threat(reaction=0.0)
     fast = played(FIXED, LATE, 50, place)
     assert not fast.alarm.any() and crashed(fast).all()
-    assert (onset_of(played(FIXED, LATE, 50, place_of(horizon=299).with_threat(reaction=0.1))) == 182).all()
+    assert (onset_of(played(FIXED, LATE, 50, place_of().with_threat(reaction=0.1))) == 182).all()
 
 
 def test_the_watch_and_the_list():
     """Fixed challenges come at their steps alone; watch adds its share of the alarmed steps, none of them with none."""
-    quiet = played(f"{FIXED},times=[2,7,300]", "none", 3, place_of())
+    quiet = played(f"{FIXED},times=[2,7,300]", "none", 3)
     assert (np.flatnonzero(~quiet.valid[:, 0, 0, 0]) + 1).tolist() == [2, 7, 300]
     for watch, share in (("none", 0.0), ("0.0", 0.0), ("0.3", 0.3), ("1.0", 1.0)):
         trace = played(f"{FIXED},times=[20],watch={watch}", "radar_jam:start_step=20,length=30", 100, place_of(horizon=50), terminate=False)
