@@ -245,7 +245,7 @@ def test_who_cannot_know_the_state_is_named(gain, directed):
     """With a sensor missing from everybody who reaches agent i, the model is refused, naming exactly these agents."""
     rng, named = np.random.default_rng(3), set()
     base = network(1, 2, agents=6, states=6, graph="complete", system="modal")
-    for _ in range(14):
+    for _ in range(18):
         graph = np.eye(6, dtype=bool)
         for _ in range(int(rng.integers(3, 16))):
             i, j = rng.choice(6, 2, replace=False)
