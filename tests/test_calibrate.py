@@ -214,6 +214,7 @@ def _of_fifty(defence, roads):
     return calibrate(defence, 0.02, scenarios=roads, onsets=50, most_steps=200_000)
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("how", ["p", "negative"])
 def test_scores_that_are_crowded_or_negative_have_thresholds(how, roads):
     """With as many digits as it takes: the same alarms as those of the score that they are made of."""

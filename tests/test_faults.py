@@ -229,7 +229,8 @@ def test_a_list_of_attacks_survives_every_kill(tmp_path: Path, kill_at: Any) -> 
     assert held[-1] == f"fdi:value={at}" and at > 3
 
 
-@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.long), 5])
+@pytest.mark.long  # the board above dies in the same way
+@pytest.mark.parametrize("every", [1, 5])
 def test_a_process_that_dies_at_any_step_leaves_nothing_broken(tmp_path: Path, every: int) -> None:
     """os._exit at a call of the hook: nothing is tidied up, and the rerun still gives the same bytes and leaves no temporary file."""
     last = _all_die("rows", tmp_path, every)

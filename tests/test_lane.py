@@ -146,6 +146,7 @@ def test_the_compiled_loop_has_the_bits_of_the_plain_one(defence, attack):
     trace_as_plain(*loop_of(NAME, defence, attack))
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("knowledge", ["black", "white"])
 def test_the_compiled_environment_has_the_bits_of_the_plain_one(tmp_path, knowledge):
     as_plain({"scenario": NAME, "defence": "chi2_kf", "knowledge": knowledge, "value": 0.5}, 70, tmp_path)

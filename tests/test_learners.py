@@ -286,6 +286,7 @@ def test_other_errors_in_training_stay_what_they_are(paid: dict[str, Any]) -> No
         learner("ppo", paid).learn(2000, report)
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", ["maskable_ppo", "recurrent_ppo", "dqn", "sac"])
 def test_a_checkpoint_that_does_not_fit_is_refused(name: str, paid: dict[str, Any], tmp_path: Path) -> None:
     """Cut off, of another seed, of other settings, of another learner."""
