@@ -126,7 +126,16 @@ class Table:
 
     def nominal(self) -> list[str]:
         """Return scenarios with the plant that the defence knows."""
-        return list(self.suite.nominal)
+        return self.named(self.suite.nominal)
+
+    def robust(self) -> list[str]:
+        """Return the suite's scenarios for robustness."""
+        return self.named(self.suite.robustness)
+
+    def named(self, texts: Iterable[str]) -> list[str]:
+        """Return the names, as rows have them, of some of the suite's scenarios: that of a file is not its path."""
+        names = dict(zip(self.suite.scenarios, self.scenarios, strict=True))
+        return [names[text] for text in texts]
 
     def applies(self, scenario: str) -> Array:
         """Return (attackers,) bool: the attacks that count in this scenario.

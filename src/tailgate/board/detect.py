@@ -21,7 +21,7 @@ from tailgate.evaluation.checks import Finding, Unplayable, again, differences, 
 
 from .check import VERDICTS
 from .consistency import same
-from .detection import EFFORT, Effort, Progress, detection, plants, stealth_impact
+from .detection import EFFORT, Effort, Progress, detection, name_of, plants, stealth_impact
 from .false_alarms import false_alarms
 from .files import agree, amended, known, load, read_board, save, suite_of
 from .schema import DETECTION, Data
@@ -91,7 +91,7 @@ def _said(effort: Effort, suite: Suite) -> Data:
 
 def _shared(suite: Suite) -> list[list[str]]:
     """Return scenarios that share a threshold."""
-    return [list(names) for names in plants(suite.nominal).values()]
+    return [[name_of(name) for name in names] for names in plants(suite.nominal).values()]
 
 
 def _effort(held: Data, effort: Effort = EFFORT) -> Effort:
@@ -106,7 +106,7 @@ def _whole(held: Data, defence: str, suite: Suite, attacks: Sequence[str], effor
     lines = [line for part in DETECTION for line in held.get(part, ()) if line["defence"] == defence and not _outdated(line)]
     there = {tuple(line[key] for key in PLACE if key in line) for line in lines}
     return all(
-        (plant, h) in there or all((name, attack, h) in there for name in names for attack in attacks)
+        (plant, h) in there or all((name_of(name), attack, h) in there for name in names for attack in attacks)
         for plant, names in plants(suite.nominal).items() for h in effort.hours
     )  # fmt: skip
 

@@ -75,6 +75,12 @@ def plants(scenarios: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 
 @functools.lru_cache(maxsize=256)
+def name_of(scenario: str) -> str:
+    """Return the name of a suite's scenario, as boards have it: that of a file is not its path."""
+    return load_scenario(scenario).name
+
+
+@functools.lru_cache(maxsize=256)
 def threshold(defence: str, scenarios: tuple[str, ...], hours: float, onsets: int, most_steps: int) -> Calibration:
     """Return the threshold of a defence for a mean time between false alarms [h] on these clean runs, and its measured time.
 
@@ -129,7 +135,7 @@ def detection(
                 made = bench.at(level)
                 for attack in attacks:
                     rows = run_cell(_cell(suite, name, dose, defence, attack, effort.episodes, beacon), made, uses=bench.uses)
-                    head = {"defence": defence, "scenario": name, "attack": attack, "hours": h, "threshold": level}
+                    head = {"defence": defence, "scenario": name_of(name), "attack": attack, "hours": h, "threshold": level}
                     head |= {name: True for name, holds in (("watched", not bench.field), ("rarer", rarer)) if holds}
                     found.append(head | _detected(rows))
         update("detection", done, len(work), defence)

@@ -253,7 +253,7 @@ def _robustness(table: Table, worst: Worst | None, dose: int) -> list[Data]:
         return []
     base = worst.undamaged(worst.at(dose, table.nominal())[0], dose)
     out = []
-    for name in table.suite.robustness:
+    for name in table.robust():
         if any(scenario == name for scenario, _ in worst.pairs):
             pair, _ = worst.at(dose, [name])
             value, low = worst.undamaged(pair, dose), 1.0 - worst.bounds(dose, [name])[1]

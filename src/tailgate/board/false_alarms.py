@@ -18,7 +18,7 @@ from tailgate.core.scenario import Suite
 from tailgate.evaluation.attack_free import HOUR, Bench, Count, count_onsets, side_by_side
 from tailgate.evaluation.rounds import numbered
 
-from .detection import plants
+from .detection import name_of, plants
 from .schema import Data
 
 PURPOSE = "report"
@@ -58,7 +58,7 @@ def false_alarms(suite: Suite, detected: Sequence[Data], wanted: int, most_steps
     """
     out, done = [], set[tuple[str, tuple[str, ...], float]]()
     for line in detected:
-        names = next(names for names in plants(suite.scenarios).values() if line["scenario"] in names)
+        names = next(names for names in plants(suite.scenarios).values() if line["scenario"] in map(name_of, names))
         if (key := (line["defence"], names, line["hours"])) in done:
             continue
         done.add(key)
@@ -68,7 +68,7 @@ def false_alarms(suite: Suite, detected: Sequence[Data], wanted: int, most_steps
             first += len(drives[name].steps)
         least = dispersion([drives[name] for name in names if name not in suite.robustness])
         head = {name: line[name] for name in ("defence", "hours", "threshold", "watched", "rarer") if name in line}
-        out += [head | {"scenario": name} | _figures(drives[name], least) for name in names]
+        out += [head | {"scenario": name_of(name)} | _figures(drives[name], least) for name in names]
     return out
 
 

@@ -100,7 +100,7 @@ def _suite(table: Table, alpha: float) -> Data:
         "name": suite.name, "about": suite.about, "version": VERSION, "hash": suite.hash, "doses": list(table.doses),
         "shown": {str(dose): why for dose, why in suite.shown.items()}, "limit": CRITICAL, "bound": suite.bound, "alpha": alpha,
         "scenarios": [
-            {"name": name, "about": scenario.about, "robustness": name in suite.robustness, "hash": scenario.config_hash}
+            {"name": name, "about": scenario.about, "robustness": name in table.robust(), "hash": scenario.config_hash}
             for name, scenario in table.scenarios.items()
         ],
         "episodes": max(len(seeds) for seeds in table.seeds.values()), "purpose": table.purpose, "beacon": table.beacon, "rows": table.rows,

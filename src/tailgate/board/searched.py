@@ -178,7 +178,7 @@ def unsearched(table: Table, row: Row, searches: Sequence[Data], plan: Adaptive)
             cell = cells.get((name, dose))
             if cell is None:
                 return f"the ensemble has not attacked it on {name} at dose {dose}"
-            if lacks := _lacking(cell, name in suite.nominal):
+            if lacks := _lacking(cell, name in table.nominal()):
                 return f"the search on {name} at dose {dose} is not whole: {lacks}"
         here = {attack for cell in line["cells"] if cell["scenario"] == name for one in cell["members"] if (attack := one["attack"])}
         left = set(asked[name]) - table.withdrawn

@@ -275,8 +275,11 @@ def load_suite(name: str) -> Suite:
 
 def _look_through(suite: Suite) -> None:
     """Raise InputError for a component that does not exist, and for attackers that cannot be trained."""
+    held: dict[str, str] = {}
     for name in suite.scenarios:
         scenario = load_scenario(name)
+        if (other := held.setdefault(scenario.name, name)) != name:
+            raise InputError(f"suite {suite.name}: scenarios", name, f"another name than {scenario.name}, which is that of {other}")
         if suite.progress is not None and not scenario.brief().model.followers.any():
             raise InputError(f"suite {suite.name}: progress", suite.progress, f"none: nobody follows another in {name}")
     for spec in (*(Spec("defence", text) for text in suite.defences), *(Spec("attack", text) for text in suite.attacks)):
