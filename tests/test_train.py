@@ -19,6 +19,7 @@ from safetensors.numpy import save_file
 from tailgate import cli
 from tailgate.agents.learners.ppo import Config, Learner
 from tailgate.base.errors import InputError
+from tailgate.studies import distil
 from tailgate.training import comparison, train
 
 ENVIRONMENT: dict[str, Any] = {
@@ -140,21 +141,21 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_the_command_trains_compares_and_writes_a_page(
     here: Path, tmp_path: Path, small_run: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = [*small_run, "others=[kf]", "workers=2", "--json"]
-    done = subprocess.run([*COMMAND, *arguments], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    report = json.loads(done.stdout)
+    for name in ("SELECT", "SHOWN"):  # episodes of the rules on the page
+        monkeypatch.setattr(distil, name, 12)
+    assert cli.main(["train", *small_run, "others=[kf]", "--json"]) == 0
+    done = capsys.readouterr()
+    report = json.loads(done.out)
     assert set(report["advantage"]) == {"no attack", "own yoked schedule", "best scripted attack"}
     assert report["attacks"][0]["label"] == "no attack"
-    assert ("did no damage" in done.stderr) == (report["advantage"]["no attack"]["value"] <= 0.0)
+    assert ("did no damage" in done.err) == (report["advantage"]["no attack"]["value"] <= 0.0)
     run = tmp_path / "runs" / "quickstart"
     rows = [json.loads(line) for line in (run / "rows.jsonl").read_text().splitlines()]
     played = {(row["defence"], row["attack"]) for row in rows}
     assert ("chi2_kf", str(Path("runs/quickstart/policy-0.json"))) in played and ("kf", "none") in played
     page = (run / "page" / "index.html").read_text(encoding="utf-8")
     assert "quickstart" in page and "learned" in page
-    again = next(line for line in done.stderr.splitlines() if line.startswith("play:"))
-    capsys.readouterr()
+    again = next(line for line in done.err.splitlines() if line.startswith("play:"))
     assert cli.main([*shlex.split(again)[2:], "--seeds", "2", "--json"]) == 0  # what the policy was granted is granted
     (entry,) = json.loads(capsys.readouterr().out)
     assert entry["attack"] == str(Path("runs/quickstart/policy-0.json")) and entry["n"] == 2
