@@ -143,7 +143,7 @@ def _spoil(thing, seen):
 
 
 @pytest.mark.parametrize("attack, place", [(a, p) for p in PLACES for a in ATTACKS])
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 def test_an_attack_runs_within_what_is_granted(attack, place):
     """Its rows do not depend on their batch; before the onset, and ever after on the agents not granted, what is sent arrives."""
     loop = loop_of(place, "chi2_dkf")

@@ -114,7 +114,7 @@ FACE_NAMES = ("single", "sb3", *AUTORESETS)
 PLAYED = [(name, engine) for name in SYSTEMS for engine in ("auto", "plain") if (name, engine) != (HIGHWAY, "plain")]
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("face", FACE_NAMES)
 @pytest.mark.parametrize("name, engine", PLAYED)
 def test_nothing_that_was_handed_out_is_used_again(name, engine, face, tiny):

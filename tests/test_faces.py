@@ -79,7 +79,7 @@ def test_both_checkers_pass_without_a_warning(action, turn, knowledge, strict, b
         sb3.check_env(gymnasium.make(ID, **arguments), warn=True)
 
 
-@pytest.mark.thin(8)
+@pytest.mark.thin(11)
 @pytest.mark.parametrize("knowledge, sees", [("black", True), ("white", False)])
 @pytest.mark.parametrize("action", ACTIONS)
 @pytest.mark.parametrize("name", [RADAR, PLATOON, NETWORK])
