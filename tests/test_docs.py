@@ -47,8 +47,7 @@ def test_the_new_defence_is_evaluated_from_the_command_line(package: Path) -> No
     assert table[0]["crash"]["value"] == 0.0
     rows = [json.loads(line) for line in (package / "rows.jsonl").read_text().splitlines()]
     assert {row["status"] for row in rows} == {"ok"}
-    build = [sys.executable, "-m", "tailgate", "leaderboard", "build", "--rows", "rows.jsonl", "--out", "page"]
-    assert subprocess.run(build, cwd=package, capture_output=True, text=True, check=False).returncode == 0
+    assert main(["leaderboard", "build", "--rows", str(package / "rows.jsonl"), "--out", str(package / "page")]) == 0
     assert "mydefence:Saturated" in (package / "page" / "index.html").read_text(encoding="utf-8")
 
 
@@ -67,7 +66,7 @@ def test_the_radar_example_challenges_and_hears(package: Path, monkeypatch: pyte
     (package / "myradar.py").write_text(_blocks("docs/new-defence.md", "python")[2], encoding="utf-8")
     monkeypatch.chdir(package)
     command = ["evaluate", "--scenario", "radar-following-v0", "--defence", "myradar:Listening", "--attack", "none"]
-    assert main([*command, "--attack", "echo_delay:start_step=60", "--seeds", "20", "--out", "rows.jsonl"]) == 0
+    assert main([*command, "--attack", "echo_delay:start_step=60", "--seeds", "20", "--workers", "1", "--out", "rows.jsonl"]) == 0
     rows = [json.loads(line) for line in (package / "rows.jsonl").read_text(encoding="utf-8").splitlines()]
     assert {row["status"] for row in rows} == {"ok"} and {row["dose"] for row in rows} == {10}  # the scenario's own
     clean, attacked = ([row for row in rows if (row["attack"] == "none") == quiet] for quiet in (True, False))
@@ -149,7 +148,7 @@ def evaluated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
 
     def called(*arguments: str) -> list[dict[str, Any]]:
         monkeypatch.chdir(tmp_path)
-        assert main(["evaluate", "--scenario", "thesis-ch4-v0", "--dose", "none", "--seeds", "4", "--json", *arguments]) == 0
+        assert main(["evaluate", "--scenario", "thesis-ch4-v0", "--dose", "none", "--seeds", "4", "--workers", "1", "--json", *arguments]) == 0
         return list(json.loads(capsys.readouterr().out))
 
     return called
