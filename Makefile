@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo docs wheels test test-long test-rllib nightly lint bench crash fuzz clean
+.PHONY: demo docs wheels test short-tests test-long test-rllib nightly lint bench crash fuzz clean
 
 demo: $(VENV)/.ready  ## train an adversary against a gated Kalman filter, compare it with scripted attacks, write the page
 	$(BIN)/python train.py
@@ -15,7 +15,10 @@ docs: $(VENV)/.docs  ## the documentation as a site, boards and replays with it:
 test test-long: export OPENBLAS_NUM_THREADS = 1
 test test-long: export OMP_NUM_THREADS = 1
 
-test: $(VENV)/.ready lint  ## lint, types, tests; a thread in each of two processes
+test: $(VENV)/.ready  ## lint, types, tests, side by side; a thread in each of two processes
+	@$(MAKE) --no-print-directory --jobs 2 lint short-tests
+
+short-tests: $(VENV)/.ready
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 test-long: $(VENV)/.docs lint  ## and the tests that take a minute each, as before a release

@@ -39,11 +39,13 @@ def pytest_collection_modifyitems(config, items):
     if config.getoption("--long"):
         return
     turns: Counter[str] = Counter()
+    kept, left = [], []
     for item in items:
         thin, name = item.get_closest_marker("thin"), item.nodeid.partition("[")[0]
         turns[name] += 1
-        if item.get_closest_marker("long") or (thin and (turns[name] - 1) % thin.args[0]):
-            item.add_marker(pytest.mark.skip(reason="long: make test-long"))
+        (left if item.get_closest_marker("long") or (thin and (turns[name] - 1) % thin.args[0]) else kept).append(item)
+    config.hook.pytest_deselected(items=left)
+    items[:] = kept
 
 
 def pytest_runtest_setup(item):

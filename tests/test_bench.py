@@ -27,7 +27,7 @@ def _compiled() -> bool:
     return True
 
 
-needs_compiler = pytest.mark.skipif(not _compiled(), reason="no C compiler")
+needs_compiler = pytest.mark.skipif("not _compiled()", reason="no C compiler")  # a text: it is asked when a test begins
 
 
 def _seat(place):

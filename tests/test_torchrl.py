@@ -1,5 +1,7 @@
 """TorchRL's environment: its specs, rollouts with resets, and the values of the tensors below it."""
 
+from collections.abc import Callable
+from importlib.util import find_spec
 from typing import Any
 
 import pytest
@@ -10,27 +12,36 @@ from .card import HostCard, host_card, needs_compiler
 from .engines import short
 
 torch = pytest.importorskip("torch")
-pytest.importorskip("torchrl")
-
-from torchrl.envs.utils import check_env_specs  # noqa: E402
-
-from tailgate.envs.torch import TailgateEnv, TensorVecEnv  # noqa: E402
+if find_spec("torchrl") is None:
+    pytest.skip("no torchrl", allow_module_level=True)
 
 __all__ = ["host_card"]
 FOLLOWING = {"scenario": "gusty-stop-and-go-v0", "defence": "chi2_kf"}
 
 
+@pytest.fixture(scope="module")
+def made() -> Callable[..., Any]:
+    """Return the class of the environment; its library takes seconds to import, in the process that plays these tests alone."""
+    from tailgate.envs.torch import TailgateEnv
+
+    return TailgateEnv
+
+
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=needs_compiler)])
 @pytest.mark.parametrize("action", ["mode", "continuous"])
-def test_specs(action: str, device: str, host_card: HostCard) -> None:
-    check_env_specs(TailgateEnv(8, device=device, action=action, **FOLLOWING))
+def test_specs(action: str, device: str, host_card: HostCard, made: Callable[..., Any]) -> None:
+    from torchrl.envs.utils import check_env_specs
+
+    check_env_specs(made(8, device=device, action=action, **FOLLOWING))
 
 
-def test_rollouts_reset_what_is_done(tmp_path: Any) -> None:
+def test_rollouts_reset_what_is_done(tmp_path: Any, made: Callable[..., Any]) -> None:
+    from tailgate.envs.torch import TensorVecEnv
+
     place = tmp_path / "short.yaml"
     place.write_text(short("gusty-stop-and-go-v0"))
     arguments = FOLLOWING | {"scenario": str(place), "action": "mode"}
-    env = TailgateEnv(8, **arguments)
+    env = made(8, **arguments)
     env.set_seed(3)
     torch.manual_seed(0)
     found = env.rollout(150, break_when_any_done=False)
@@ -47,6 +58,6 @@ def test_rollouts_reset_what_is_done(tmp_path: Any) -> None:
             observation, _ = plain.reset(mask=over)
 
 
-def test_what_it_refuses() -> None:
+def test_what_it_refuses(made: Callable[..., Any]) -> None:
     with pytest.raises(InputError, match="autoreset"):
-        TailgateEnv(8, autoreset="same_step", **FOLLOWING)
+        made(8, autoreset="same_step", **FOLLOWING)
