@@ -42,7 +42,7 @@ def test_each_page_with_blocks_is_played() -> None:
     assert all(page in (ROOT / "tests" / test).read_text(encoding="utf-8") for page, test in ELSEWHERE.items())
 
 
-@pytest.mark.thin(8)
+@pytest.mark.thin(16)
 @pytest.mark.parametrize("page", PAGES)
 def test_the_blocks_of_a_page_run(page: str, tmp_path: Path) -> None:
     for needed in PAGES[page]:

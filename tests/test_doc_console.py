@@ -13,7 +13,7 @@ import pytest
 from tests.logs import openacc
 from tests.pages import PAGES, ROOT, blocks, commands
 
-LIGHT = ("docs/engine.md", "docs/scenarios.md", "docs/new-attack.md")  # these run each time, the others by make test-long
+LIGHT = ("docs/engine.md", "docs/scenarios.md")  # these run each time, the others by make test-long
 LIMIT = 1800  # seconds for a command
 PROGRAMS = {"tailgate": ["-m", "tailgate"], "python": [], "pytest": ["-m", "pytest"], "pip": ["-m", "pip"]}
 

@@ -279,7 +279,7 @@ def test_two_boards_in_a_folder_are_refused(tmp_path: Path) -> None:
         board_in(tmp_path)
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 @pytest.mark.parametrize(
     ("suite", "place", "attack"),
     [

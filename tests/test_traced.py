@@ -35,7 +35,7 @@ from tailgate.play.commanded import Commanded
 from tailgate.play.rollouts import Rollout, rollout_of
 from tailgate.play.trace import Trace, rollout
 
-from .engines import as_plain
+from .engines import as_plain, short
 
 ENVIRONMENTS = [  # beyond those of test_traced_cars.py and test_traced_many.py
     {"scenario": "gusty-stop-and-go-v0", "defence": "chi2_kf", "action": "mode", "interval": 3,
@@ -208,7 +208,7 @@ def test_a_state_of_another_form_has_another_program(names, monkeypatch):
     monkeypatch.setattr(commanded, "_made", Remembered())
     keys, attack = draws.keys("report", range(3)), NoAttack()
     for name in names:
-        loop = load_scenario(name).loop(Spec("defence", "chi2_kf").make())
+        loop = dataclasses.replace(load_scenario(name), horizon=150).loop(Spec("defence", "chi2_kf").make())
         wanted = rollout(loop, attack, keys, plain=True)
         for made in (rollout_of(loop, attack), commanded.commanded(loop)):
             played = made.play(keys, True) if isinstance(made, Rollout) else made.play(attack, keys, True)
@@ -259,8 +259,10 @@ def test_threads_change_no_bit():
     {"scenario": "platoon-gusty-v0", "defence": "chi2_dkf", "action": "continuous"},
     {"scenario": "radar-following-v0", "defence": "cra", "frames": 2},
 ])  # fmt: skip
-def test_a_single_environment(arguments):
+def test_a_single_environment(arguments, tmp_path):
     """Its short way to the code gives what a batch of one gives, types included."""
+    (tmp_path / "short.yaml").write_text(short(arguments["scenario"]))
+    arguments = arguments | {"scenario": str(tmp_path / "short.yaml")}
     one, other = (AdversaryEnv(engine=engine, **arguments) for engine in ("traced", "plain"))
     chance = np.random.default_rng(0)
     for seed in (4, None, 9):
