@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from tailgate.evaluation import stats
 from tailgate.evaluation.paired import mcnemar
 from tailgate.evaluation.stats import at_least, holm, mean_time, median_limits, paired_difference, paired_ratio, proportion
 
@@ -35,6 +36,14 @@ def test_a_seed_gives_the_same_interval_twice() -> None:
     a, b = rng.random((3, 50)) < 0.6, rng.random((3, 50)) < 0.4
     assert paired_difference(a, b) == paired_difference(a, b)
     assert paired_difference(a, a) == (0.0, 0.0, 0.0)
+
+
+def test_drawing_many_at_once_gives_the_interval_of_one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Published intervals would move in their last digit."""
+    a, b = np.random.default_rng(1).normal(size=(2, 3, 129))
+    many = paired_difference(a, b)
+    monkeypatch.setattr(stats, "AT_ONCE", 1)
+    assert paired_difference(a, b) == many
 
 
 def test_pairing_narrows_the_interval() -> None:

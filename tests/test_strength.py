@@ -1,6 +1,5 @@
 """Measures of strength: twins of a schedule, monotone curves and critical doses; pictures and commands of all."""
 
-import functools
 import importlib.util
 import json
 import math
@@ -17,7 +16,6 @@ from tailgate.base.errors import InputError
 from tailgate.core import draws
 from tailgate.core.draws import Role
 from tailgate.core.registry import Spec
-from tailgate.evaluation.stats import paired_difference
 from tailgate.play.metrics import METRICS
 from tailgate.play.trace import MEMORY, Trace, episodes_at_once, rollout
 from tailgate.studies.collect import add_run
@@ -39,13 +37,6 @@ half_place = strong.half_place
 def brief_place(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The scenario cut to 32 steps, attacked from step 10 on: a budget of 20 is spent within it."""
     return str(strong.cut(tmp_path_factory.mktemp("scenario"), 32, onset=10))
-
-
-@pytest.fixture(autouse=True)
-def few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Intervals of reports from 100 resamples; test_stats has the intervals themselves."""
-    for module in ("timing", "policies"):
-        monkeypatch.setattr(f"tailgate.studies.{module}.paired_difference", functools.partial(paired_difference, resamples=100))
 
 
 # -- twins of a schedule

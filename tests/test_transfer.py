@@ -1,6 +1,5 @@
 """The matrix of transfer: trained on one defence, played on others."""
 
-import functools
 import importlib.util
 import json
 import math
@@ -13,7 +12,6 @@ from tailgate import cli
 from tailgate.agents.policy.network_policy import PolicyAttack
 from tailgate.base.errors import InputError
 from tailgate.core.registry import entries
-from tailgate.evaluation.stats import paired_difference
 from tailgate.studies.figures import transfer_figure
 from tailgate.studies.policies import mean, trained
 from tailgate.studies.transfer import _registered, difference, transfer
@@ -24,13 +22,6 @@ strong = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(strong)
 THREAT, ZOO, _always, _recorded = strong.THREAT, strong.ZOO, strong.always, strong.recorded
 brief_place, half_place = strong.brief_place, strong.half_place
-
-
-@pytest.fixture(autouse=True)
-def few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Intervals from 200 resamples; test_stats has the intervals themselves."""
-    for module in ("policies", "transfer"):
-        monkeypatch.setattr(f"tailgate.studies.{module}.paired_difference", functools.partial(paired_difference, resamples=200), raising=False)
 
 
 def test_many_defences_have_a_line_each(capsys: pytest.CaptureFixture[str], tmp_path: Path, brief_place: str) -> None:

@@ -8,6 +8,8 @@ from numpy.typing import ArrayLike
 
 from tailgate.core import Array
 
+AT_ONCE = 1 << 14  # numbers that a bootstrap draws at once
+
 
 class Interval(NamedTuple):
     """A point estimate and its interval."""
@@ -101,7 +103,9 @@ def paired_difference(a: Array, b: Array, level: float = 0.95, resamples: int = 
     runs, episodes = delta.shape
     value, of_episode = float(delta.mean()), delta.mean(axis=0)
     rng = np.random.default_rng(seed)
-    means = np.array([of_episode[rng.integers(episodes, size=episodes)].mean() for _ in range(resamples)])
+    few = max(1, AT_ONCE // episodes)
+    sizes = (min(few, resamples - at) for at in range(0, resamples, few))
+    means = np.concatenate([of_episode[rng.integers(episodes, size=(size, episodes))].mean(axis=1) for size in sizes])
     low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
     spread = 0.0
     if runs > 1:
