@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -112,7 +113,7 @@ class Table:
     shared: frozenset[str] = frozenset()  # what is on no list and all entries of a board have met: who joins has to have met it too
     reach: Mapping[tuple[str, str], Reach] = dataclasses.field(default_factory=dict)  # of clean runs, by scenario and defence
 
-    @property
+    @cached_property
     def asked(self) -> frozenset[str]:
         """Return the attacks that every defence has to have met."""
         return self.shared.union(self.listed)
@@ -137,15 +138,18 @@ class Table:
         names = dict(zip(self.suite.scenarios, self.scenarios, strict=True))
         return [names[text] for text in texts]
 
-    def applies(self, scenario: str) -> Array:
-        """Return (attackers,) bool: the attacks that count in this scenario.
+    @cached_property
+    def applies(self) -> dict[str, Array]:
+        """The attacks that count, by scenario: (attackers,) bool.
 
         An attack does not count without a meaning against any defence, or if no defence owes it.
         """
-        state = self.state[scenario]
-        played = ~np.isin(state, (SKIPPED, MISSING)).all(axis=(0, 2))
         owed = np.array([attacker.attack in self.asked for attacker in self.attackers], bool)
-        return np.asarray(played | (owed & (state == MISSING).any(axis=(0, 2))))
+        out = {}
+        for name, state in self.state.items():
+            played = ~np.isin(state, (SKIPPED, MISSING)).all(axis=(0, 2))
+            out[name] = np.asarray(played | (owed & (state == MISSING).any(axis=(0, 2))))
+        return out
 
 
 def tabulate(rows: Iterable[Row], suite: Suite, added: Sequence[str] = (), withdrawn: Iterable[str] = ()) -> Table:

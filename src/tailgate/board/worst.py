@@ -37,11 +37,11 @@ class Worst:
 
         An attack that is not asked of everybody counts against the defences that it was played against.
         """
-        index = self.table.defences.index(self.defence)
+        index, known = self.table.defences.index(self.defence), self.table.known(self.knowledge)
         out: list[tuple[str, int]] = []
         for name in self.table.scenarios:
-            applies, mine = self.table.applies(name), self.table.state[name][index]
-            for i in self.table.known(self.knowledge):
+            applies, mine = self.table.applies[name], self.table.state[name][index]
+            for i in known:
                 if applies[i] and (self.table.attackers[i].attack in self.table.asked or (mine[i] != MISSING).any()):
                     out.append((name, i))
         return out
