@@ -74,6 +74,7 @@ def test_all_begin_at_the_leaders_speed_and_gap():
     assert np.ptp(speed) > 2.0 and np.abs(speed - lead).max() < 0.2 and np.abs(gap - 3.5 - 1.2 * speed).max() < 0.2
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("name", ["road-following-v0", "road-string-v0", "road-us06-v0", "road-aeb-own-v0", "road-aeb-shared-v0"])
 def test_nobody_collides_or_brakes_in_an_emergency_without_an_attack(name):
     _, trace = play(name, seeds=60)

@@ -48,6 +48,7 @@ def test_policies_play_as_attacks_and_are_trained_once(tmp_path: Path) -> None:
     assert json.loads(policies[0].read_text())["training"]["config"]["defence"] == "kf"
 
 
+@pytest.mark.long
 def test_published_policies_are_not_trained_again(tmp_path: Path) -> None:
     """Without checkpoints what is there stays byte by byte and what is missing comes back the same; what is of another training is refused."""
     black = configs_of(SUITE, "kf", tmp_path, extra=("workers=1",))[:1]

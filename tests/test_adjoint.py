@@ -86,6 +86,7 @@ def test_what_has_no_rule_is_left_to_pytorch():
     assert not Injection(place.loop(spec.make(), spec.entry.uses), Trigger()).compiled
 
 
+@pytest.mark.long
 def test_several_agents_without_machine_code_are_refused(tmp_path):
     arena = Arena("test", "platoon-gusty-v0", 20, "trust_dkf", {"kinds": ("fdi",), "fdi_bound": 3.0}, None)
     with pytest.raises(NotApplicable, match=r"agents.*5.*PyTorch takes half a minute"):

@@ -73,7 +73,7 @@ def test_chance_is_per_step_and_agent_and_independent(sends):
     np.testing.assert_array_equal(every | ~each, True)  # an agent is hit on all of its wires
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("attack", ["fdi", "fdi_gaussian", "dos_jam", "fdi_ramp", "fdi_uniform"])
 def test_chance_thins_an_attack_and_changes_nothing_else(attack, sends):
     """What is sent to those that are hit is what is sent with chance 1, which is the attack without `chance`; 0 sends nothing."""
@@ -199,7 +199,7 @@ GUARDS = ["chi2_dkf", "chi2_dkf:gain=steady", "chi2_kf", "composed:filter=dkf,de
 @pytest.mark.parametrize("defence", GUARDS)
 @pytest.mark.parametrize("scenario, index, least", [("platoon-braking-v0", 0, 0.5), ("platoon-braking-v0", 1, 0.3), ("thesis-ch5-v0", 3, 0.5)])
 @pytest.mark.parametrize("sign", [-1, 1])
-@pytest.mark.thin(7)
+@pytest.mark.thin(10)
 def test_stealth_pushes_each_agent_up_to_its_own_gate(defence, scenario, index, least, sign, short, play):
     """Every attacked agent is moved in the wanted sense by more than noise would, and never alarms in an attacked step."""
     agents = (1, 3) if scenario == "platoon-braking-v0" else (0, 4, 7)

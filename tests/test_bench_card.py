@@ -39,6 +39,7 @@ def test_the_record(host_card: HostCard, tmp_path: Any, capsys: pytest.CaptureFi
     assert main(["bench", "--device", "cuda", "--list"]) == 0 and "gusty-stop-and-go-v0" in capsys.readouterr().out
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("little")
 def test_bits_that_differ(host_card: HostCard, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     fetch = HostCard.fetch_rows

@@ -133,6 +133,7 @@ def test_falsified_accelerations_reach_the_controllers_and_no_sensor():
     assert np.abs(bounded.wires - bounded.clean).max() == pytest.approx(10.0)
 
 
+@pytest.mark.long
 def test_falsified_accelerations_collide_and_lost_ones_do_not():
     """A bias of 10 m/s^2 takes the cars out of their gaps when they stop; at a headway of 3 s lost messages, even for seconds, do not."""
     lie = tailgate.make_attack("fdi", value=10.0, targets=("predecessor_acceleration",))

@@ -76,6 +76,7 @@ def test_onsets_are_those_of_the_metric(short):
     np.testing.assert_array_equal(onsets[:, 0], (alarm[1:] & ~alarm[:-1]).sum(axis=0) + alarm[0])
 
 
+@pytest.mark.long
 @pytest.mark.thin(3)
 @pytest.mark.parametrize(("defence", "scenario"), [("chi2_kf", "braking-v0"), ("imm", "stop-and-go-v0"), ("cusum_kf", "radar-braking-v0")])
 def test_the_plain_loop_finds_the_same_threshold(monkeypatch, defence, scenario):
@@ -118,6 +119,7 @@ def test_a_long_mean_time_is_found_on_fewer_alarms(roads):
         calibrate("chi2_kf", 0.3, scenarios=roads[:1], onsets=400, most_steps=180_000)
 
 
+@pytest.mark.long
 def test_results_do_not_depend_on_the_batch_and_seeds_are_not_shared(roads):
     """The same record for batches of 5 and 64, and it is JSON; no two scenarios play the same noise."""
     one, two = (calibrate("chi2_kf", 0.01, scenarios=roads, onsets=4, batch=batch).as_data() for batch in (5, 64))

@@ -78,7 +78,7 @@ def test_scenario_one_is_survived_with_the_joint_regression(attack):
     assert np.median(trace.gap[-1]) == pytest.approx(5.03, abs=0.01)
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(5)
 @pytest.mark.parametrize("defence", ["none", "algorithm2", f"{FIXED},filter=hold_last", "pycra:challenge=fixed", f"{FIXED},watch=none,freeze=false"])
 @pytest.mark.parametrize("attack", [JAM, LATE])
 def test_scenario_one_collides_in_every_run_without_it(attack, defence):

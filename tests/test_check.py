@@ -83,7 +83,7 @@ def published() -> Data:
 
 
 @pytest.mark.parametrize("name", sorted(path.parent.name for path in ROOT.glob("results/*/board.json*")))
-@pytest.mark.thin(5)
+@pytest.mark.thin(11)
 def test_what_is_published_follows_from_its_cells(name: str) -> None:
     board = load(board_in(ROOT / f"results/{name}"))
     assert strays(board, load_suite(name)) == []

@@ -271,6 +271,7 @@ def test_an_unknown_command_explains_itself(capsys: pytest.CaptureFixture[str]) 
     assert stop.value.code == 2 and "evaluate" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_file_of_other_rows_is_kept(run: Run, tmp_path: Path) -> None:
     """The same command replaces its own rows; another one sets them aside and says where."""
     part = ["evaluate", "--scenario", "thesis-ch4-v0", "--dose", "none", "--attack", "none", "--seeds", "2", "--out", "rows.jsonl"]

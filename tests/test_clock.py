@@ -78,6 +78,7 @@ def test_the_defences_of_a_suite_are_timed_in_turn() -> None:
         measure(SUITE, ["mine:Mine"])
 
 
+@pytest.mark.long
 def test_a_page_says_what_a_step_costs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """From the file that the command writes beside the board; without one it says nothing."""
     (tmp_path / "rows.jsonl").write_bytes(encode(run(cells_of(SUITE))))

@@ -135,6 +135,7 @@ def test_an_address_asks_for_the_engine(capsys):
     assert "--address: got 'head:6379'; expected --engine ray" in capsys.readouterr().err
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("address", "expected"),
     [

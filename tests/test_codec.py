@@ -69,6 +69,7 @@ def _played(loop, steps=12, value=7.0, rows=3):
 # -- car following as it was
 
 
+@pytest.mark.long
 def test_car_following_gives_the_numbers_that_were_recorded():
     """Observation and returns of 400 steps, autoreset included, as they were before other systems had faces."""
     seen = [
@@ -130,6 +131,7 @@ def test_the_published_policies_still_fit(number):
 # -- observations of many agents
 
 
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("knowledge, sees", [("black", False), ("grey", False), ("white", False), ("black", True)])
 @pytest.mark.parametrize("kind", PLACES)
 def test_observations_are_finite_named_and_of_a_sensible_size(kind, knowledge, sees):

@@ -66,7 +66,7 @@ def test_every_defence_applies_somewhere():
         load_scenario(PLACE[name]).loop(tailgate.make_defence(name), entries("defence")[name].uses)
 
 
-@pytest.mark.thin(12)
+@pytest.mark.thin(20)
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_rows_of_a_defence_do_not_depend_on_their_batch(defence, short, play):
     """trace_hash of each seed is the same in batches of 1, 7 and 64, in which some readings are falsified and others jammed."""
@@ -76,14 +76,14 @@ def test_rows_of_a_defence_do_not_depend_on_their_batch(defence, short, play):
     assert [set(np.unique(whole.kind[9:, seed])) - {Kind.NONE} for seed in EITHER] == [{Kind.FDI}, {Kind.DOS_JAM}]
 
 
-@pytest.mark.thin(4)
+@pytest.mark.thin(7)
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_rows_of_an_attack_do_not_depend_on_their_batch(attack, short, play):
     """trace_hash of each seed is the same in batches of 1, 7 and 64, under a budget and a cooldown too."""
     _batches(lambda seeds: _play(play, short(budget=20, duration=7, cooldown=2), "chi2_kf", attack, seeds, terminate=False))
 
 
-@pytest.mark.thin(10)
+@pytest.mark.thin(19)
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_rows_of_a_scenario_do_not_depend_on_their_batch(name, short, play):
     """trace_hash of each seed is the same in batches of 1, 7 and 64, collisions included; of many agents in 1, 2 and 6, for fewer steps."""
@@ -96,7 +96,7 @@ def test_rows_of_a_scenario_do_not_depend_on_their_batch(name, short, play):
     assert [some.trace_hash(0), some.trace_hash(1), alone.trace_hash(0)] == [known[5], known[2], known[4]]
 
 
-@pytest.mark.thin(7)
+@pytest.mark.thin(15)
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_outputs_are_finite_and_of_the_right_shape(defence, short, loop_of):
     """Without an attack and under every kind, with the widest jammer, a defence returns finite arrays of the declared shapes and types."""
@@ -128,6 +128,7 @@ def test_commands_are_well_formed(attack, short, loop_of, granting):
         state, _ = loop.advance(state, command)
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_an_attack_changes_only_what_is_granted_and_when(attack, short, play):
     """One wire, one window, ten steps: every other wire and step arrives as sent, bit for bit."""
@@ -156,7 +157,7 @@ def test_before_onset_an_attacked_episode_is_the_clean_one(attack, short, play):
         assert not np.array_equal(attacked.estimate[24:], clean.estimate[24:])
 
 
-@pytest.mark.thin(7)
+@pytest.mark.thin(15)
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_swapping_the_defence_leaves_the_world_draws(defence, short, play, monkeypatch):
     """Clean runs of two defences draw the same numbers for the world: comparisons are paired."""

@@ -202,6 +202,7 @@ def test_falsified_accelerations_collide_without_the_clip_and_not_with_it():
         assert not safe.collided.any() and safe.gap[:, :, 1:].min() > InputClip().clearance
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("sides", ["above", "both"])
 def test_the_command_stays_within_the_bound_of_the_own_law(sides):
     """Recomputed from what was received: at most `bound` above, and with both sides below, within the own law's limits."""
@@ -216,6 +217,7 @@ def test_the_command_stays_within_the_bound_of_the_own_law(sides):
         assert (trace.control[:, :, 0] == 0.0).all()  # nobody holds the leader back
 
 
+@pytest.mark.long
 def test_one_side_does_not_follow_false_readings():
     """A false gap of +60 m on the own sensor: with a lower bound too the car is driven into the one ahead, whatever the filter knows."""
     options = {"attack": "fdi:value=60,targets=[distance],chance=0.9", "place": "platoon-braking-v0", "onset": 20, "changes": {"horizon": 250}}

@@ -116,6 +116,7 @@ def test_trust(host_card: HostCard) -> None:
 LEARNERS = {"cem": "cem={population: 4, episodes: 2, elite: 0.5}", "ppo": "ppo={envs: 8, rollout: 16, batch_size: 64, epochs: 1}"}
 
 
+@pytest.mark.thin(2)
 @needs_compiler
 @pytest.mark.parametrize("learner", LEARNERS)
 def test_a_training_ends_in_the_same_policy(learner: str, host_card: HostCard, tmp_path: Any) -> None:

@@ -137,6 +137,7 @@ def test_projected_gradient_recovers_state_and_support():
         np.testing.assert_allclose(np.einsum("qti,qtj->ij", plan.O[0], plan.O[0]), np.eye(3), atol=1e-12)
 
 
+@pytest.mark.long
 def test_the_error_falls_at_every_trigger():
     """f after each projection is not above f after the one before: two windows, looked at after every gradient step."""
     triggers = 0
@@ -177,6 +178,7 @@ def test_the_share_that_the_paper_needs_is_a_bound_on_random_directions():
     assert bounds.restricted(rows, 0)[0] == pytest.approx(0.5)
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", ["l1_decoder", "etpg", "etpl", "l0_robust"])
 def test_a_decoder_leaves_attacked_sensors_out(name):
     """Two liars of seven with noise: the position's error stays that of an honest window, and nobody else is blamed before."""
@@ -286,6 +288,7 @@ def test_a_vague_attack_leaves_the_prediction(linear_model):
     assert out[0][0].under.x[0, 0, 0] == pytest.approx(9.0, abs=1e-6)
 
 
+@pytest.mark.long
 def test_bernoulli_on_the_road():
     """Clean: r is seldom above its prior. A lasting bias of 20 on two sensors is found, and its size within 3 standard deviations."""
     place = load_scenario("redundant-two-v0")

@@ -58,6 +58,7 @@ def test_both_engines_replay_the_same_bits():
     assert [fast.trace_hash(i) for i in range(3)] == [plain.trace_hash(i) for i in range(3)] and (plain.kind != 0).any()
 
 
+@pytest.mark.long
 def test_the_smoother_is_nearer_to_the_truth_than_the_filter():
     recording, gap = _recording()
     out, played = detect([recording], ["kf"])

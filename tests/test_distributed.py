@@ -96,6 +96,7 @@ def test_the_weights_add_up_to_one(model):
     np.testing.assert_allclose(same, np.broadcast_to(x, same.shape), atol=1e-7)
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("gain", ["steady", "varying"])
 @pytest.mark.parametrize("attack", ["none", "dropout", "fdi"])
 def test_one_agent_alone_is_a_kalman_filter(gain, attack, short, play):
@@ -198,6 +199,7 @@ def with_plant(place, sensor=None, horizon=60, **plant):
     return changed.with_threat(agents=())
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("seed", range(5))
 def test_without_noise_the_errors_vanish(seed):
     """Theorem 5.3.2 on random systems and graphs; on the way max_i e_i' P_i^-1 e_i never grows (5.12)."""
@@ -215,6 +217,7 @@ def test_without_noise_the_errors_vanish(seed):
     assert (V[1:][big[1:]] <= V[:-1][big[1:]] * (1.0 + 1e-9)).all()
 
 
+@pytest.mark.long
 def test_agents_that_see_one_mode_each_know_all_of_them():
     """Weak sensing: (A, C_i) is observable for nobody, yet everybody converges; a Kalman filter of its own does not."""
     place = with_plant(
@@ -334,6 +337,7 @@ class Halting(Platoon):
         return out
 
 
+@pytest.mark.long
 @pytest.mark.thin(3)
 @pytest.mark.parametrize(("name", "command", "fits"), [("lasso_dkf", 4.73, 0.18), ("norm_resilient", 5.27, 0.15), ("chi2_dkf:gain=steady", 21.8, 0.25)])
 def test_the_clean_error_of_the_braking_platoon_is_its_leaders_halt(name, command, fits):

@@ -33,7 +33,7 @@ from .distributed import RNG, error, model_of, place_of, play, random_state
 NAMES = ("chi2_dkf", "consensus_kf", "disagreement_dkf", "dkf_oracle", "saturated_dkf", "trimmed_consensus", "trust_dkf")
 
 
-@pytest.mark.thin(4)
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("place", ["thesis-ch5-v0", "weak", "platoon-braking-v0"])
 @pytest.mark.parametrize("defence", NAMES)
 def test_they_stay_finite_and_their_rows_do_not_depend_on_the_batch(defence, place):
@@ -52,6 +52,7 @@ def test_they_stay_finite_and_their_rows_do_not_depend_on_the_batch(defence, pla
         assert [some.trace_hash(0), alone.trace_hash(0)] == [known[3], known[4]]
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("defence", [name for name in NAMES if name != "trimmed_consensus"])
 def test_without_attack_and_noise_they_converge(defence):
     """On the thesis's network and under weak sensing the errors vanish, faster or slower."""
@@ -113,6 +114,7 @@ def test_a_threshold_can_be_calibrated(name):
     assert turned.parts()[1] == ChiSquare(33.0) and held.parts()[1] == TailChiSquare() and turned.parts()[0] == held.parts()[0]
 
 
+@pytest.mark.long
 def test_a_steady_gate_stays_locked_where_the_varying_one_opens_again():
     """The leader stops at once, which no linear model foresees: its gate shuts, and with the steady gain for good."""
     place = dataclasses.replace(load_scenario("platoon-braking-v0"), horizon=480)
@@ -337,6 +339,7 @@ def test_growing_modes_that_an_agent_cannot_see_are_refused():
 # --- parts --------------------------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_parts_compose():
     """Every filter takes any detector and mitigation, and the named defence is such a composition."""
     for name in ("saturated_dkf", "disagreement_dkf", "trust_dkf", "consensus_kf", "trimmed_consensus", "dkf"):

@@ -61,6 +61,7 @@ def test_the_new_defence_plays_as_an_object(package: Path, monkeypatch: pytest.M
     sys.modules.pop("mydefence", None)
 
 
+@pytest.mark.long
 def test_the_radar_example_challenges_and_hears(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A fifth of the steps are muted, and an attacker who radiates is heard."""
     (package / "myradar.py").write_text(_blocks("docs/new-defence.md", "python")[2], encoding="utf-8")
@@ -154,6 +155,7 @@ def evaluated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     return called
 
 
+@pytest.mark.long
 def test_the_detector_of_the_documentation_plays(tmp_path: Path, evaluated: Evaluated) -> None:
     """As a part named on the command line, attacked through its own gate as well."""
     (tmp_path / "mydetector.py").write_text(_blocks("docs/detectors.md", "python")[0], encoding="utf-8")
@@ -163,6 +165,7 @@ def test_the_detector_of_the_documentation_plays(tmp_path: Path, evaluated: Eval
     assert stealth["alarm_onsets"]["median"] == 0.0 and stealth["max_error"]["median"] > 20.0
 
 
+@pytest.mark.long
 def test_the_adapted_filter_of_the_documentation_plays(tmp_path: Path, evaluated: Evaluated) -> None:
     """filterpy's fading-memory filter, named as module:Class with its parameter."""
     (tmp_path / "myfilter.py").write_text(_blocks("docs/new-defence.md", "python")[3], encoding="utf-8")

@@ -74,6 +74,7 @@ def test_places_follow_the_distances(graph):
     assert np.array_equal(places, layout(graph))
 
 
+@pytest.mark.long
 def test_few_many_and_rows():
     """One and two agents, a hundred on a circle, and a platoon with its leader on the right."""
     for n in (1, 2, 100):

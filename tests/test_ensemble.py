@@ -74,6 +74,7 @@ def assert_same(place, found, wanted, text):
         assert np.array_equal(found.error, wanted.error), text
 
 
+@pytest.mark.long
 @pytest.mark.thin(6)
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.thin(2) if name in ("platoon", "network") else ()) for name in PLACES]
@@ -140,6 +141,7 @@ def test_the_plain_loop_plays_the_same():
     assert all(np.array_equal(a, b) for a, b in zip(fast, plain, strict=True)) and plain.ended.any()
 
 
+@pytest.mark.long
 def test_numbers_lie_within_the_threat_model():
     """The channel refuses nothing that the space proposes for its value."""
     for name in PLACES:
@@ -250,6 +252,7 @@ def test_the_clean_distance_is_the_metric(monkeypatch):
     np.testing.assert_array_equal(dataclasses.replace(place).reach("tune", 3, 8), wanted)
 
 
+@pytest.mark.long
 def test_policies_are_learned(tmp_path, monkeypatch):
     """From rest alone, a network finds an echo that the gate lets through; the same seed finds the same network."""
     suite = load_suite("radar-v0")

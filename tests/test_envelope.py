@@ -168,6 +168,7 @@ def test_no_alarm_in_the_runs_that_it_was_learned_from(learned):
     assert not alarm.any() and trace.score.max() <= 1.0 and trace.score.max() > 0.5
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", SHIPPED)
 def test_fresh_clean_runs_leave_no_invariant_too_often(name):
     """No invariant is left surely more often than the rate that was asked for, if steps were independent. They are not."""
@@ -276,6 +277,7 @@ def test_what_is_no_envelope_is_refused(content, tmp_path):
 # -- the command
 
 
+@pytest.mark.long
 def test_a_log_and_its_scenario_teach_the_same(tmp_path):
     """Files and play have the same steps, at however many doses: the same invariants to the last bit, and damage is found."""
     pytest.importorskip("pyarrow")

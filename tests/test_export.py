@@ -27,6 +27,7 @@ def _trace(name, steps=150):
     return rollout(loop, Spec("attack", PLACES.get(name, "none")).make(), draws.keys("tune", range(2)))
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", PLACES)
 def test_a_table_holds_the_numbers_of_the_trace(name):
     trace = _trace(name)
@@ -47,6 +48,7 @@ def test_a_table_holds_the_numbers_of_the_trace(name):
         assert np.abs(believed - table["gap"][mine] - off).max() < 1e-9
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", PLACES)
 def test_cars_of_a_lane_are_a_car_and_a_gap_apart(name):
     cars = cars_of(_trace(name))

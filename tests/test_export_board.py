@@ -54,6 +54,7 @@ def test_every_figure_of_the_csv_is_that_of_the_board(name: str) -> None:
     assert {"below", "above"} <= {row["critical_dose"] for row in rows}
 
 
+@pytest.mark.long
 def test_csv_of_few_defences_and_of_one_without_figures() -> None:
     board = load(FILE)
     assert len({row["defence"] for row in _csv(board, 3)}) == 3
@@ -88,6 +89,7 @@ def test_bibtex_names_the_board_and_its_version() -> None:
     assert text.count("{") == text.count("}") and TITLE in text and TITLE in (FILE.parents[2] / "CITATION.cff").read_text()
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize(("form", "start"), [("pdf", b"%PDF"), ("svg", b"<?xml")])
 def test_pictures_are_vectors_and_repeat(form: str, start: bytes, tmp_path: Path) -> None:

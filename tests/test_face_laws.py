@@ -114,7 +114,7 @@ FACE_NAMES = ("single", "sb3", *AUTORESETS)
 PLAYED = [(name, engine) for name in SYSTEMS for engine in ("auto", "plain") if (name, engine) != (HIGHWAY, "plain")]
 
 
-@pytest.mark.thin(4)
+@pytest.mark.thin(9)
 @pytest.mark.parametrize("face", FACE_NAMES)
 @pytest.mark.parametrize("name, engine", PLAYED)
 def test_nothing_that_was_handed_out_is_used_again(name, engine, face, tiny):
@@ -173,6 +173,7 @@ def test_a_copy_goes_on_as_its_original(name, engine, face, how, tiny):
     alike([driver.step() for _ in range(steps)], [other.step() for _ in range(steps)])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("action", ["continuous", "increment"])
 def test_a_copy_before_the_first_reset_and_of_vectors(action):
     """An environment that has not begun, one with frames, and the generator of its spaces and seeds."""

@@ -79,7 +79,7 @@ def test_both_checkers_pass_without_a_warning(action, turn, knowledge, strict, b
         sb3.check_env(gymnasium.make(ID, **arguments), warn=True)
 
 
-@pytest.mark.thin(11)
+@pytest.mark.thin(23)
 @pytest.mark.parametrize("knowledge, sees", [("black", True), ("white", False)])
 @pytest.mark.parametrize("action", ACTIONS)
 @pytest.mark.parametrize("name", [RADAR, PLATOON, NETWORK])
@@ -133,6 +133,7 @@ def test_the_defaults_of_an_id_hold_everywhere(tiny):
         sb3.BatchVecEnv(2, "tailgate/Plato")
 
 
+@pytest.mark.long
 def test_info_is_finite_and_has_what_the_system_has(tiny):
     """On a road the smallest gap; without one the largest error of an agent, 0 at the start of an episode."""
     for name in filter(here, SYSTEMS):
@@ -166,7 +167,7 @@ def _actions(vec, steps, seed=0):
 SEEDED = [*((ID, action, interval) for action in ACTIONS for interval in (1, 3)), (PLATOON, "mode", 1), (PLATOON, "increment", 3), (NETWORK, "ramp", 3), (NETWORK, "continuous", 1)]
 
 
-@pytest.mark.thin(4)
+@pytest.mark.thin(7)
 @pytest.mark.parametrize("name, action, interval", SEEDED)
 def test_row_i_is_the_single_environment_of_seed_s_plus_i(name, action, interval, tiny, same_bits):
     """Two whole episodes: observation, reward, flags and info of every row, bit for bit; autoreset adds 1 to the episode."""

@@ -59,6 +59,7 @@ def test_genes_are_quantiles_of_the_draws():
     assert low < onset.min() < low + 0.1 and high - 0.1 < onset.max() < high
 
 
+@pytest.mark.long
 def test_the_row_of_a_genome_is_its_text(same_bits):
     """A trial in a batch has the robustness, to the last bit, that its text has in the plain engine."""
     case = Case("quick-v0", "gusty-stop-and-go-v0", 12, "chi2_kf", (), "G[0,60] gap > 2")
@@ -88,6 +89,7 @@ def test_a_road_alone_is_worse_than_as_many_random_ones():
     assert (found.trials, found.episodes) == (192, 1536)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sampler", ["tpe", "cmaes"])
 def test_an_interrupted_search_finds_the_same(tmp_path, monkeypatch, sampler):
     job = Search(ROAD, sampler, 3 * search.GENERATION, 5)

@@ -100,6 +100,7 @@ def _energy_gain(filter_, model):
     return worst
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("name", ["gusty-stop-and-go-v0", "thesis-ch4-v0"])
 def test_h_infinity_keeps_its_bound(name):

@@ -101,6 +101,7 @@ def test_a_fingerprint_is_of_the_rows_of_a_board() -> None:
             assert golden._all(row["trace_hash"] for row in rows) == cell["trace"]
 
 
+@pytest.mark.long
 def test_what_moved_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """A decision anywhere, a trace only on the platform that it was recorded on; the scenario, the defence and the attack are said."""
     name = "ch6-v0/thesis-ch6-v0"

@@ -156,6 +156,7 @@ def test_the_exported_program_plays_the_schedule(tmp_path):
             assert np.array_equal(got.detach().numpy()[path.live], wanted[: len(path.live)][path.live])
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("text", [
     "fdi:value=-2.5,start_step=30", "fdi:value=2,targets=[velocity],trigger=near,threshold=91,burst=3,pause=4",
     "fdi_ramp:base=0.5,rate=-0.25,limit=3,trigger=closing,threshold=1,length=9", "fdi:value=1,signs=2",

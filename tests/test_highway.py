@@ -199,6 +199,7 @@ def test_nobody_ahead_is_a_car_at_the_end_of_sight():
     assert (d, dv, v) == (140.0, 0.0, scene.speed[0, 0]) and a > 0.0
 
 
+@pytest.mark.long
 def test_cut_ins_and_hard_brakings_happen():
     """A scripted cut-in makes the gap jump to where a car was beside; a scripted braking slows the car ahead down as told."""
     none = tailgate.make_attack("none")

@@ -25,6 +25,7 @@ def _received(y, valid=None):
     return Received(y, np.ones(y.shape, bool) if valid is None else valid, np.zeros(y.shape[:2]))
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("factors", [(1.0, 4.0, 900.0), (1.0, 100.0)])
 def test_it_equals_filterpys_over_100_steps(factors, linear_model):
@@ -60,6 +61,7 @@ def test_it_equals_filterpys_over_100_steps(factors, linear_model):
         assert np.min(seen) < 0.1 and np.max(seen) > 0.9 and state.mu.shape == (2, 1, count)
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("attack", ["none", "fdi", "dos_jam", "dropout"])
 def test_one_model_is_the_kalman_filter(attack, short, play, same_bits):
     """With the nominal model alone the estimates are kf's to the last bit, and nothing alarms."""

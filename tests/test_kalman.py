@@ -101,6 +101,7 @@ def test_scalar_steady_state_is_the_golden_ratio(linear_model):
     np.testing.assert_allclose(gain, golden - 1, rtol=1e-12)
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("attack", ["none", "fdi", "dos_jam", "dropout", "dos_hold"])
 def test_a_gate_at_infinity_is_the_kalman_filter(attack, short, play):
     """chi2_kf with eta = 1e12 equals kf to the last bit of the trace."""
@@ -151,6 +152,7 @@ def test_false_alarm_rate_with_two_sensors_is_exp_of_minus_half_eta():
 _VALUES = st.floats(-1.0, 1.0)
 
 
+@pytest.mark.long
 @given(st.lists(_VALUES, min_size=9, max_size=9), st.lists(_VALUES, min_size=2, max_size=2), st.floats(0.5, 40.0))
 def test_one_accepted_sample_moves_the_estimate_by_at_most_the_bound(root, direction, eta):
     """|x - x-| <= sqrt(eta lambda_max(P- - P+)) for every innovation within the gate."""

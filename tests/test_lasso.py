@@ -142,6 +142,7 @@ def test_the_robust_kalman_filters_problem_is_626():
         assert ours <= near * (1.0 + 1e-10) and ours <= far * (1.0 + 1e-10) and far <= ours * (1.0 + 1e-3)
 
 
+@pytest.mark.long
 def test_with_independent_noise_it_is_the_huber_estimator():
     """Sv = sigma^2: a = soft(y - C X, lam sigma^2 / 2), and X minimises Huber's loss of y - C X with (X - xb)' Q (X - xb)."""
     for sigma in (0.05, 1.0, 7.0):
@@ -275,7 +276,7 @@ def test_sensors_that_are_not_accepted_leave_the_problem(unit, same_bits):
 DISTRIBUTED = ("lasso_dkf", "lasso_dkf:gain=varying", "lasso_dkf:unit=sigma,lam=1", "centralised_lasso", "centralised_kf")
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(9)
 @pytest.mark.parametrize("defence", DISTRIBUTED)
 @pytest.mark.parametrize("attack", ["fdi_gaussian:sd=3,chance=0.5", "dos_hold:chance=0.5"])
 def test_platoon_rows_do_not_depend_on_their_batch(defence, attack):

@@ -40,6 +40,7 @@ def _bytes(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize(("split", "purpose", "episodes"), [("train", "train", 3), ("dev", "tune", 2)])
 def test_a_log_is_the_trace_of_its_episodes(made: tuple[Path, dict[str, Any]], split: str, purpose: str, episodes: int) -> None:
     """Every signal and every label of every step, by the seeds of the split."""
@@ -219,6 +220,7 @@ def test_a_log_that_is_killed_anywhere_goes_on(every: int, tmp_path: Path, monke
     assert at > 25
 
 
+@pytest.mark.long
 def test_a_part_that_the_disk_damaged_is_played_again(made: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def step(what: str, path: Path) -> None:
         if what == "write" and path.name == "README.md":
@@ -254,6 +256,7 @@ def test_the_card_and_the_schema_describe_every_column(made: tuple[Path, dict[st
     assert "CC0" in card and held["suite"] in card
 
 
+@pytest.mark.long
 @pytest.mark.thin(3)
 @pytest.mark.parametrize(
     ("scenario", "defence", "attack", "names"),

@@ -309,6 +309,7 @@ def test_at_its_own_headway_the_reference_is_the_entry_of_the_board(small: tuple
     assert sum(int(hits_of(held).sum()) for held in cells) > 0
 
 
+@pytest.mark.long
 def test_who_keeps_a_longer_gap_is_compared_at_equal_gap(small: tuple[Suite, Path], tmp_path: Path) -> None:
     given, made = small[0], json.loads((small[1] / "board.json").read_text())
     found = measure_gap(made, given, ["brake_kf", "coast", "stand_still"])

@@ -121,6 +121,7 @@ def test_a_number_of_gaussians_that_nobody_can_want(J):
         make("defence", "bernoulli", components=J)
 
 
+@pytest.mark.long
 def test_the_traced_engine_plays_it_to_the_bit():
     """67 episodes of car following, the loop alone and with the attack."""
     loop, rival = loop_of("stop-and-go-v0", "bernoulli:components=3", "fdi:value=-6,start_step=52,targets=[position]", 70)

@@ -172,6 +172,7 @@ def test_parts_of_other_worlds_are_refused():
         platoon.controller.prepare(here.brief().model)
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("agents, states, sensors", [(1, 1, 1), (1, 4, 2), (3, 1, 2), (2, 3, 1), (10, 20, 14), (12, 7, 9)])
 def test_networks_of_any_size_run(agents, states, sensors):
     """From one agent with one state to more readings than states: finite, in the declared shapes, and nearer than the prior."""
@@ -195,6 +196,7 @@ def test_without_noise_the_system_is_its_matrix():
     assert abs(start.std() - 2.0) < 5 * 2.0 / np.sqrt(2 * start.size) and abs(start.mean()) < 5 * 2.0 / np.sqrt(start.size)
 
 
+@pytest.mark.long
 def test_noise_has_the_stated_variance_and_is_told_apart():
     """noise_var of the plant and of the sensors, independent between states, readings, agents and steps; Q and R are what is told."""
     place = network(
@@ -321,6 +323,7 @@ def test_the_alarm_of_a_group_is_on_while_any_agent_alarms():
     assert most_at_once(loop.model, 4096) == 3125 and most_at_once(load_scenario("stop-and-go-v0").brief().model, 4096) == 4096
 
 
+@pytest.mark.long
 def test_pictures_and_tables_of_a_network(tmp_path, capsys):
     """Without a road the state's error is drawn and printed, not gaps or collisions; a road beside it keeps its own."""
     rows, places = tmp_path / "rows.jsonl", ["--scenario", "network-weak-v0", "--scenario", "thesis-ch4-v0"]

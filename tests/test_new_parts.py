@@ -68,6 +68,7 @@ def command(installed: Path) -> Command:
     return run
 
 
+@pytest.mark.long
 def test_the_package_of_the_page_does_what_the_page_says(command: Command) -> None:
     """Two processes know the names; the table comes out."""
     plants = json.loads(command("-m", "tailgate", "list", "plants", "--json"))["plants"]

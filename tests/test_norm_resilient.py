@@ -369,6 +369,7 @@ def test_the_covariance_of_the_varying_filter_is_the_linear_filters():
     assert np.abs(a.x - b.x).max() > 0.1
 
 
+@pytest.mark.long
 def test_rows_are_made_orthogonal_to_their_own_accuracy():
     """V'X has orthogonal rows, V'Y turned with it, for full, dependent, graded and zero rows; a root of S has Y'Y = S, the other Y'Y = S^-1."""
     rng = np.random.default_rng(8)

@@ -133,7 +133,7 @@ def test_played_losses_are_those_predicted(play):
 
 
 @pytest.mark.parametrize("threat", [{"duration": 3}, {"duration": 2, "cooldown": 4}, {"end": 50, "cooldown": 3}, {"budget": None, "end": 20}])
-@pytest.mark.thin(3)
+@pytest.mark.thin(4)
 def test_the_channel_accepts_every_loss(threat, play):
     """Whatever the threat model limits, nothing is refused and the schedule is used up as far as it may be."""
     place = dataclasses.replace(load_scenario("linear-dos-v0"), horizon=40).with_threat(**threat)

@@ -51,6 +51,7 @@ def test_pettingzoo_is_content(game, cycles):
         parallel_seed_test(lambda: tailgate.parallel_env(**game), num_cycles=cycles)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("place, plain, steered", [
     ("stop-and-go-v0", "chi2_kf", "steered"), ("stop-and-go-v0", "brake_kf:eta=9", "steered:defence=brake_kf,defence.eta=9"),
     ("stop-and-go-v0", "cusum_kf", "steered:defence=cusum_kf"), ("stop-and-go-v0", "mewma_kf", "steered:defence=mewma_kf"),
@@ -88,6 +89,7 @@ def test_the_challenge_knob_sets_how_often_the_probe_is_muted(short):
         assert abs(muted / n - chance) < 3.29 * np.sqrt(chance * (1 - chance) / n)
 
 
+@pytest.mark.long
 def test_rows_are_steered_on_their_own():
     """Each row obeys its own knobs: a batch with three settings equals three batches with one."""
     duel = Duel.make(**GUSTY)

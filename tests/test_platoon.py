@@ -122,6 +122,7 @@ def test_the_desired_gap_is_a_fixed_point(name, topology, speed):
     assert after[0] == pytest.approx(speed * model.dt)
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize(
     "name, topology", [("cacc", "predecessor_leader"), ("ploeg_cacc", "predecessor"), ("consensus_cacc", "bidirectional"), ("consensus_cacc", "two_predecessor")]
 )
@@ -228,6 +229,7 @@ def test_the_filters_error_dies_out():
     assert (error[0] > 0.1).all() and (error[-1] < 1e-3 * error[0]).all()
 
 
+@pytest.mark.long
 def test_who_is_told_the_command_does_not_lose_the_leader():
     """While the leader brakes, its acceleration is an error of those who are not told its command, and of nobody else."""
     errors = {}

@@ -57,7 +57,7 @@ def _policy(path: Path, action: dict[str, Any], knowledge: str = "black", seed: 
     return save_policy(path / "policy", network, header)
 
 
-@pytest.mark.thin(9)
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("interval", [1, 5])
 @pytest.mark.parametrize("knowledge", ["black", "white"])
 @pytest.mark.parametrize("action", ["timing", "mode", "ramp", "continuous", "increment"])
@@ -65,6 +65,7 @@ def test_stepping_the_environment_and_playing_as_an_attack_give_one_trace(tmp_pa
     _same_trace(tmp_path, {"action": action, "interval": interval, "rate": 0.5}, knowledge, "gusty-stop-and-go-v0", {"threat": THREAT})
 
 
+@pytest.mark.long
 def test_a_policy_of_several_frames_plays_as_it_was_trained(tmp_path: Path) -> None:
     """What it remembers of earlier decisions is what the environment showed."""
     _same_trace(tmp_path, {"action": "mode", "interval": 3}, "black", "gusty-stop-and-go-v0", {"threat": THREAT, "frames": 4})
@@ -138,6 +139,7 @@ def test_a_yoked_policy_attacks_exactly_when_its_schedule_says(tmp_path: Path) -
     assert np.array_equal(trace.kind != 0, schedule)
 
 
+@pytest.mark.long
 def test_a_policy_without_timing_has_no_timing_advantage(tmp_path: Path) -> None:
     """A policy that attacks at the same steps in every episode is its own yoked twin."""
     brief = _place("black").brief()

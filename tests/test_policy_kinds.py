@@ -67,6 +67,7 @@ def test_a_policy_of_every_kind_plays_alone_as_in_company_and_steps_as_it_plays(
     assert same_bits(np.array(attacked), alive.kind[2::3])
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("kind", ["recurrent", "masked", "squashed"])
 def test_a_yoked_policy_of_every_kind_attacks_when_its_schedule_says(tmp_path: Path, kind: str) -> None:
     """The memory goes on, the masks give way: the schedule is one of attacks that were accepted."""

@@ -228,6 +228,7 @@ def test_the_polynomial_is_that_of_least_squares(model):
     np.testing.assert_allclose(out[1][2][:, 0, :2], y[0], atol=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["hold_last", "autoregressive", "polynomial", "joint_rls"])
 @pytest.mark.thin(4)
 def test_every_predictor_stays_finite_and_composes(name, play):

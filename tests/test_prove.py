@@ -147,6 +147,7 @@ def test_ten_thousand_runs_in_a_lane_stay_inside_of_the_tube(size):
         assert np.abs(trace.control).max() < 5.0
 
 
+@pytest.mark.long
 def test_ten_thousand_runs_behind_a_leader_stay_inside_of_the_tube():
     place, size = car(targets=("position",)), 1.0
     trace = play(place, f"fdi_uniform:low={-size},high={size},start_step=20")
@@ -157,6 +158,7 @@ def test_ten_thousand_runs_behind_a_leader_stay_inside_of_the_tube():
     assert kept == 1.0 and used > 0.1
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("noise", [None, "uniform"])
 def test_ten_thousand_runs_stay_inside_of_the_gaussian_tube_whatever_the_law_of_the_sensor(noise):
     """With a probability of 99 %; the deviation of the error is the one that the tube has."""
@@ -236,6 +238,7 @@ def test_a_smaller_budget_proves_no_less():
     assert found[0] == 10.0 and all(a >= b for a, b in itertools.pairwise(found)) and found[3] > found[4] * 0.99
 
 
+@pytest.mark.long
 def test_limits_of_the_command_count():
     place = load_scenario(LANE).with_threat(budget=20, targets=("lane_offset",))
     tube = Tube(affine_loop(place, at_rest=True), alpha=1e-3)
@@ -254,6 +257,7 @@ def test_a_late_message_is_worse_only_if_it_is_led_on():
     assert gaps[True] == sorted(gaps[True]) and gaps[False] == sorted(gaps[False], reverse=True) and gaps[True][0] == gaps[False][0]
 
 
+@pytest.mark.long
 def test_the_largest_delay_is_the_one_at_which_an_attack_uses_up_the_gap():
     """An injection that leaves a centimetre at 3 steps of delay takes it at 4; one that takes all without a delay leaves no delay."""
     rest = {"at_rest": True, "lead": (-0.5, 0.5)}

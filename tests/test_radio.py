@@ -47,6 +47,7 @@ def test_the_pull_off_grows_by_its_rate_up_to_the_bound():
     assert late.value[9:13, 0, 0, 0] == pytest.approx([0.0, 0.0, 0.5, 1.0], abs=1e-9) and not late.refused.any()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("attack", ["noise_jam", "echo_delay", "echo_pull_off", "radar_jam"])
 @pytest.mark.thin(4)
 def test_who_hops_radiates_only_after_a_step_with_a_probe(attack):

@@ -106,6 +106,7 @@ def test_the_likeliest_failure_is_the_nearest():
     assert play(found.mean[None], np.zeros((1, 3), np.uint64), 0.0)[0][0] < 0.0
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("text", ["dropout:chance=0.1", "none"])
 def test_a_branch_is_the_same_until_it_leaves(text):

@@ -69,6 +69,7 @@ def test_every_row_is_played_again_to_the_last_bit(rows):
         assert replay.verdict == "same" and replay.differences == []
 
 
+@pytest.mark.long
 def test_published_scenarios_and_white_box_attacks_are_played_again():
     """From the row alone: what the attack needs to know is in its threat model."""
     for scenario, attack in (("thesis-ch4-v0", "thesis_times"), ("gusty-stop-and-go-v0", "stealth:trigger=near,threshold=40")):
@@ -334,6 +335,7 @@ def test_a_class_is_looked_for_in_the_working_directory_only_when_named(folder, 
 # -- film
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("suffix", [".gif", ".webp"])
 def test_a_film_has_a_picture_of_every_step(pick, tmp_path, suffix):

@@ -44,6 +44,7 @@ def runs():
     }  # fmt: skip
 
 
+@pytest.mark.long
 def test_the_figures_of_the_design(runs):
     """Scenario (i): none and literal collide in every run (jammed: 189 s, delayed: 269 s), joint RLS in none: 0.14 m, a last gap of 5.03 m."""
     for guard in ("none", "algorithm2"):

@@ -37,7 +37,7 @@ def _episode(interval=1, shaped=True, **options):
 
 @pytest.mark.parametrize("interval", [1, 5])
 @pytest.mark.parametrize("reward", ["collision", "min_gap", "error", "stealth"])
-@pytest.mark.thin(3)
+@pytest.mark.thin(2)
 def test_shaping_telescopes(reward, interval):
     """The discounted sum of what shaping adds is gamma^T Phi(end) - Phi(start), Phi(end) = 0 at a collision: no policy gains."""
     total, discount = np.zeros(8), 1.0
@@ -76,6 +76,7 @@ def test_raw_rewards(interval):
         np.testing.assert_allclose(paid["error"] - paid["stealth"], alarms, atol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.thin(3)
 @pytest.mark.parametrize(("scenario", "defence"), [("network-restless-v0", "dkf"), ("platoon-gusty-v0", "dkf"), ("stop-and-go-v0", "kf")])
 def test_the_rises_of_the_peak_add_up_to_the_largest_error(scenario, defence):

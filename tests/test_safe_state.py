@@ -363,6 +363,7 @@ def test_a_linear_filter_does_not_reverse_a_car_that_the_brake_holds():
     assert not struck(trace).any() and trace.estimate[..., 1].min() >= 0.0
 
 
+@pytest.mark.long
 def test_a_platoon_brakes_on_its_own_gap_and_speed():
     """The second car's gap, falsified by much while the car ahead brakes, would make it collide as it does undefended."""
     place = dataclasses.replace(load_scenario("platoon-gusty-v0"), horizon=299).with_threat(targets=("distance",))

@@ -178,6 +178,7 @@ def test_with_all_messages_authenticated_every_forged_cell_is_the_clean_one(atta
     assert not same(open_, clean)
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("attack", ["dos_hold:start_step=60", "dropout:start_step=60"])
 def test_a_tag_does_not_keep_a_message_from_being_lost(attack):
     sealed = played_in(attack, authenticated=FIELDS)
@@ -198,6 +199,7 @@ def test_other_wires_stay_open():
         played_in(attack, authenticated=["leader"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("attack", ["delay:age=2", "fdi:value=4", "dos_hold"])
 @pytest.mark.thin(3)
 def test_the_compiled_loop_seals_as_the_plain_one_does(attack):

@@ -158,6 +158,7 @@ def tiny(first, tmp_path, monkeypatch, capsys):
     return tmp_path / "runs/tiny", first[1], command
 
 
+@pytest.mark.long
 def test_a_run_from_the_command_line(tiny):
     """Table and JSON agree, and every figure is that of the table; another configuration is not resumed."""
     home, out, command = tiny

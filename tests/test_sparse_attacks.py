@@ -212,6 +212,7 @@ def test_an_observer_bank_forgets_how_large_an_attack_is(linear_model, kind):
     np.testing.assert_allclose(results[2], results[0], atol=1e-6)
 
 
+@pytest.mark.long
 def test_the_spread_of_two_filters_is_the_difference_of_their_covariances(linear_model):
     """cov(x_J - x_S) = P_S - P_J, on 2000 matched runs."""
     model = dense(linear_model, RNG, n=2, q=4, Q=0.1)

@@ -25,6 +25,7 @@ RNG = np.random.default_rng(12)
 WINDOWED = ["l1_decoder", "etpg", "etpl", "l0_robust", "observer_bank:kind=gramian", "observer_bank", "kf_bank", "minimax", "bernoulli"]
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("text", WINDOWED)
 def test_known_inputs_are_taken_out(linear_model, text):
     """With inputs and a constant every estimate is that without them plus what they do to the state: by superposition."""

@@ -34,6 +34,7 @@ OBJECTS = [
 ]  # fmt: skip
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("defence", OBJECTS)
 def test_a_spec_says_a_defence_as_text_and_makes_it_again(defence):
     """The JSON of a spec makes an environment with the same card; the spec itself keeps the object."""

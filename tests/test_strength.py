@@ -75,6 +75,7 @@ def test_shuffled_steps_fall_evenly_and_do_not_depend_on_companions() -> None:
     assert not np.array_equal(twin[:, 17], twin[:, 18])
 
 
+@pytest.mark.long
 def test_own_and_yoked_are_those_of_the_timing_advantage(half_place: str) -> None:
     """One definition: play() agrees with policy.timing_advantage on every episode, and all schedules spend the same steps."""
     who = trained(ZOO)
@@ -122,6 +123,7 @@ def test_what_a_file_does_not_say_has_to_be_said(tmp_path: Path, brief_place: st
         timing([ZOO], episodes=1)
 
 
+@pytest.mark.long
 def test_many_episodes_are_played_as_memory_allows(monkeypatch: pytest.MonkeyPatch, half_place: str) -> None:
     """The timing advantage of 10 episodes, seven at a time, is that of all at once to the bit: each has the times of the one before it."""
     who = trained(ZOO)

@@ -20,6 +20,7 @@ def cacc(**changes):
     return make("controller", "cacc", **changes)
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("weights", WEIGHTS)
 @pytest.mark.parametrize("kp, kd", [(0.1, 0.5), (0.5, 1.0), (0.1, 4.0), (3.0, 0.5), (3.0, 4.0)])
 def test_the_law_is_string_stable_at_a_headway_of_three_seconds(weights, kp, kd):
@@ -106,6 +107,7 @@ def test_the_linear_loop_measures_what_the_model_says(name):
     assert (np.abs(found.frequency / [0.4, 1.5] - 1.0) < 0.02).all() and not found.collided.any()
 
 
+@pytest.mark.long
 def test_sampled_cars_measure_what_the_model_says():
     """Cars whose controllers run at 50 Hz on estimates have the gains of the continuous model within a few per cent."""
     place = load_scenario("platoon-braking-v0")

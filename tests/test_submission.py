@@ -55,6 +55,7 @@ def _alone(suite: Suite, defence: str) -> list[dict[str, Any]]:
     return [row for cell in cells_of(dataclasses.replace(suite, defences=(defence,))) for row in run_cell(cell)]
 
 
+@pytest.mark.long
 def test_mixed_rows_equal_those_of_a_cell_played_alone(places: tuple[str, str]) -> None:
     """To the bit, in every metric and hash, whatever ends early, is not applicable, or runs on beside it; white boxes are skipped."""
     suite = _suite(places[0], attacks=ATTACKS, seeds=7)

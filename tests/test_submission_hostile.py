@@ -346,6 +346,7 @@ def test_a_loop_at_import_costs_all_rows_in_bounded_time(world: Path, tmp_path: 
     assert not _left(world) and time.monotonic() - began < BOUND
 
 
+@pytest.mark.long
 def test_a_search_for_public_seeds_gains_nothing_on_seeds_from_a_beacon(world: Path) -> None:
     """The fifteen lines know a public episode's noise to the last bit; without the seed they are no better than the filter under them."""
 

@@ -118,6 +118,7 @@ def test_who_was_shown_a_script_does_what_it_does(tmp_path: Path) -> None:
     assert rates[0] < 0.05 and rates[2] > 0.3 and rates[1] > 0.6 * rates[2], rates
 
 
+@pytest.mark.long
 def test_a_taught_run_resumes_to_the_same_policy(tmp_path: Path, brief: str) -> None:
     """The lesson comes before the first decision, once: an interrupted run is not taught again."""
     script = "fdi_then_jam:start_step=30,inject=20"

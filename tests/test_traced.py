@@ -50,7 +50,7 @@ ENVIRONMENTS = [  # beyond those of test_traced_cars.py and test_traced_many.py
 ]  # fmt: skip
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("arguments", ENVIRONMENTS, ids=lambda a: f"{a['scenario']}-{a['defence']}")
 def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
     as_plain(arguments, 5, tmp_path)
@@ -98,6 +98,7 @@ def test_a_rollout_has_the_plain_ones_hashes(scenario, defence, rival, terminate
     assert all(np.array_equal(fast.first[name], held) for name, held in plain.first.items())
 
 
+@pytest.mark.long
 def test_who_plays_a_rollout_depends_on_its_size(monkeypatch, tmp_path):
     """Tracing takes longer than small ones do; an attack is traced for many steps alone."""
     loop, played = load_scenario("stop-and-go-v0").loop(plugin(tmp_path, monkeypatch).Saturated()), []
@@ -201,6 +202,7 @@ def test_parameters_of_other_values_are_traced_once(monkeypatch):
     assert play("chi2_kf", "fdi:trigger=near,threshold=50,value=3", 20) == before + 3  # other functions
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("names", [("car-following-noisy-v0", "car-following-late-v0"), ("car-following-lossy-v0", "car-following-noisy-v0")])
 def test_a_state_of_another_form_has_another_program(names, monkeypatch):
     """A perfect link has no state, and nothing but the state says so to the code of a step."""

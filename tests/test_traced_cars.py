@@ -161,7 +161,7 @@ ENVIRONMENTS = [
 ]  # fmt: skip
 
 
-@pytest.mark.thin(4)
+@pytest.mark.thin(9)
 @pytest.mark.parametrize("arguments", ENVIRONMENTS, ids=lambda a: f"{a['scenario']}-{a['defence']}")
 def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
     """Observations, rewards, flags and information, over restarts, a masked reset and what was held."""
@@ -186,6 +186,7 @@ def test_a_masked_reset_leaves_rows_that_wait_for_their_next_episode_alone(tmp_p
     same(*seen)
 
 
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("action", ["mode", "continuous"])
 def test_a_single_environment_is_a_batch_of_one(action):
     """The short way through a single environment gives the results, types and errors of the long one."""

@@ -111,7 +111,7 @@ NETWORKS = [
 ]
 
 
-@pytest.mark.thin(32)
+@pytest.mark.thin(43)
 @pytest.mark.parametrize(("scenario", "defence", "attack", "threat"), PLATOONS + NETWORKS)
 def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack, threat):
     many = {"onset": 10, "end": 80} if scenario in (RESTLESS, WEAK, NOISY, LARGE, THESIS, "network-weak-v0") else {}
@@ -120,7 +120,7 @@ def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack, t
     assert attack == "none" or "near" in attack or (plain.kind != 0).any()
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("followers", [1, 2, 7])
 def test_strings_of_any_length(followers, tmp_path):
     """A single row, and other numbers of states; with a manoeuvre that is a table, and no noise of the sensors."""
@@ -227,7 +227,7 @@ def test_what_is_not_finite_is_refused_as_in_the_plain_loop(scenario):
     assert said[0] == said[1]
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(3)
 @pytest.mark.parametrize(("scenario", "defence", "threat"), [
     ("platoon-gusty-v0", "dkf", ANY), ("platoon-lossy-v0", "none", ANY), (RESTLESS, "dkf", {"targets": ("y1", "y2", "y9"), "fdi_bound": 60.0}),
 ])  # fmt: skip
@@ -249,6 +249,7 @@ def test_what_an_attacker_sees_and_may_do_is_as_in_the_plain_loop(scenario, defe
     assert 0 < np.count_nonzero(refused) < np.size(refused)
 
 
+@pytest.mark.long
 @pytest.mark.thin(4)
 @pytest.mark.parametrize(("scenario", "reward"), [("platoon-gusty-v0", "collision"), (THESIS, "error")])
 @pytest.mark.parametrize("action", ["mode", "continuous"])

@@ -33,6 +33,7 @@ def _learner(seed: int = 3, **changes: Any) -> Learner:
     return Learner(seed, 0.99, SMALL, ENVIRONMENT | changes)
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("action", ["mode", "increment"])
 def test_a_resumed_run_gives_the_policy_of_an_uninterrupted_one(tmp_path: Path, action: str) -> None:
     """To the last bit, episodes in flight included: the interruption falls in the middle of them."""
@@ -193,6 +194,7 @@ def test_a_finished_comparison_is_not_played_again(
     assert cli.main(["train", "--resume", "episodes=5"]) == 0 and json.loads(report.read_text())["episodes"] == 5
 
 
+@pytest.mark.long
 def test_learners_may_share_what_was_played(here: Path, small_run: tuple[str, ...]) -> None:
     """Rows lie with the first of them; the report of the second is no comparison that its own run could go on from."""
     configs = [train.load_config("gusty", [*small_run[2:], f"name={name}"]) for name in ("one", "two")]

@@ -235,6 +235,7 @@ def test_a_large_reading_of_a_wire_that_may_be_attacked():
     assert read(Reading(threshold=40.0, latest=5), values, reach) == [False] * 4 + [True] * 2
 
 
+@pytest.mark.long
 def test_readings_are_waited_for_only_where_they_are_seen():
     """A script asks for the sight of readings, as a policy does; a threat model without it is refused, not played blindly."""
     place = load_scenario("network-restless-v0").with_threat(kinds=["dos_hold"], agents=[1, 7], budget=5)

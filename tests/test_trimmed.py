@@ -57,6 +57,7 @@ def test_lessons_are_learned_round_after_round():
     assert lost == [] and dict(taught)[5] == (0,)
 
 
+@pytest.mark.long
 def test_where_everybody_detects_everything_it_is_the_local_filter():
     """On the thesis's network, whose agents see all that lasts, trimmed_consensus is the steady Kalman filter."""
     own = play("thesis-ch5-v0", "kf:gain=steady", "fdi", value=5.0).estimate

@@ -205,6 +205,7 @@ def _detects(entry: dict[str, Any]) -> dict[str, Any]:
     return next(p for p in entry["properties"] if p["name"] == "detects")
 
 
+@pytest.mark.long
 def test_an_alarm_at_random_earns_no_bound_of_detection(short: str) -> None:
     """A class that alarms at everything would be trusted to detect: 45 % of the steps are one in any ten."""
     found = check(_suite(short, defences=("chi2_kf", AT_RANDOM, "always_alarm"), attacks=("none", SEEN)))
@@ -237,6 +238,7 @@ def test_who_names_no_clean_run_is_judged_by_one_all_the_same(short: str) -> Non
     assert good["trust"]["black"]["cells"] == 1 and [c["attack"] for c in found["cells"]] == [SEEN] * 2, "and is no part of the bound"
 
 
+@pytest.mark.long
 def test_a_detector_is_judged_by_the_vehicle_that_it_knows(short: str, tmp_path: Path) -> None:
     """Every detector alarms where the noise is larger than it knows; where nothing else was played it is judged there."""
     noisy = tmp_path / "noisy.yaml"

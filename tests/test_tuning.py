@@ -74,6 +74,7 @@ def test_an_interrupted_search_goes_on_as_if_it_had_not_been(tmp_path: Path, str
     assert states == ["COMPLETE", "COMPLETE", "FAIL", "COMPLETE", "COMPLETE"]
 
 
+@pytest.mark.long
 def test_a_finished_search_trains_nothing_and_more_trials_add_to_it(straight: tuple[tuning.Search, dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     search, report = straight
     monkeypatch.setattr(tuning, "train", lambda *_: pytest.fail("trained again"))

@@ -127,6 +127,7 @@ def _published(name: str) -> Any:
     return load(board_in(ROOT / f"results/{name}"))
 
 
+@pytest.mark.thin(5)
 @pytest.mark.parametrize("name", BOARDS)
 def test_a_published_board_is_of_the_suite_that_is_here(name: str) -> None:
     """A suite that changed leaves its board behind until its rows are played again."""

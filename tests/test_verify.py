@@ -48,6 +48,7 @@ def test_rows_of_a_version_that_plays_the_same_are_verified_and_scored_with_othe
     assert plays_as(ALIKE[-1]) == tailgate.__version__ and plays_as("0.0.1") == "0.0.1"
 
 
+@pytest.mark.long
 def test_a_row_is_the_same_with_other_workers_batches_and_companions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """40 episodes: one process and two, 24 at once, each by itself, backwards, and after an interruption."""
     (cell,) = cells_of(dataclasses.replace(SUITE, scenarios=("thesis-ch4-v0",), doses=(5,), attacks=("fdi:value=5",), seeds=40))
