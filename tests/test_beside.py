@@ -353,6 +353,7 @@ def test_the_command(compiled: None, tmp_path: Path) -> None:
     assert [e["defence"] for e in json.loads(place.read_text())["entries"]] == ["none", "chi2_kf"]
 
 
+@pytest.mark.long
 def test_the_command_plays_what_all_others_have_met(compiled: None, tmp_path: Path) -> None:
     """Whoever joins by name meets it without being asked; a board that names code to import is refused, and a suite of one's own is not."""
     file, out = tmp_path / "small-v0.yaml", tmp_path / "out"

@@ -42,6 +42,7 @@ def board() -> Data:
     return held
 
 
+@pytest.mark.long
 def test_own_and_yoked_are_of_fresh_episodes_in_which_nobody_was_chosen(board: Data) -> None:
     """Written out here, on the episodes after those of the board: who attacked when without an end, moved on by one episode, with values
     that are still the policy's own."""

@@ -322,7 +322,7 @@ def test_looking_ahead_shows_what_a_step_does():
                 assert (moved[dead] == 0.0).all() and dead.any() == (not trace.probe[k - 1].all() or (k == 33 and text[:3] == "cra"))
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(6)
 @pytest.mark.parametrize("text", ["cra", FIXED, "cra:filter=kf,suspicion=20", "cra:filter=polynomial", "cra:filter=autoregressive", "pycra", "algorithm2"])
 def test_rows_do_not_depend_on_their_batch(text):
     """trace_hash of a seed is the same alone and among others, under attack, alarm and roll-back."""

@@ -17,7 +17,7 @@ def completed(line: str, out: Path) -> set[str]:
     return {text.strip() for text in out.read_text().splitlines()}
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(6)
 @pytest.mark.parametrize(
     ("line", "words"),
     [

@@ -250,6 +250,7 @@ def test_a_white_box_may_look_ahead_at_will(defence, short, loop_of):
     assert [plain.trace_hash(i) for i in range(3)] == [curious.trace_hash(i) for i in range(3)]
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_a_defence_gets_only_what_its_card_declares(defence, short):
     """The loop fills V2V, odometry and the truth about the attack only for those who declare them."""

@@ -197,6 +197,7 @@ def test_words_of_prism_are_no_names(tmp_path):
     assert (first.name, second.name) == ("a.prism", "a.props") and first.read_text() == model(one) and second.read_text() == properties(one)
 
 
+@pytest.mark.long
 def test_a_large_chain_is_solved_and_a_larger_one_is_played(monkeypatch):
     """Sixteen nodes that nothing links: each is by itself, in 65 536 states; with a lower limit the message says what to do."""
     nodes = [node(f"n{i}", 1.0 + i / 10, 3.0, True) for i in range(16)]

@@ -158,6 +158,7 @@ def test_a_demand_that_fails(host_card: HostCard) -> None:
     assert "row 33" in str(program.broken(results["demands"], np.arange(35)))
 
 
+@pytest.mark.long
 @needs_compiler
 def test_pictures(host_card: HostCard) -> None:
     pytest.importorskip("PIL")

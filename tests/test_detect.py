@@ -143,6 +143,7 @@ def test_a_threshold_is_checked_for_a_quarter_of_the_longest_run_at_most(detecte
     assert seconds == pytest.approx({0.02: drive * math.ceil(20 * 0.02 * 3600.0 / drive), 0.05: drive * math.ceil(15_000 * dt / drive)})
 
 
+@pytest.mark.long
 def test_thresholds_of_other_plants_are_played_again_only_when_asked_for(detected: Data, tmp_path: Path) -> None:
     """Figures of a threshold that two networks of other shapes shared would otherwise stay as if it was that of each."""
     assert detected["detection"]["plants"] == [list(QUICK.nominal)]

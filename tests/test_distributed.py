@@ -145,6 +145,7 @@ def plain(model, prior, told, b, steady):
     return np.array(out), P
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("steady", [True, False])
 def test_it_equals_a_plain_implementation(model, steady):
     """The filter, with lost readings and known inputs, gives what the information form of the same equations gives."""

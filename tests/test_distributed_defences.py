@@ -33,7 +33,7 @@ from .distributed import RNG, error, model_of, place_of, play, random_state
 NAMES = ("chi2_dkf", "consensus_kf", "disagreement_dkf", "dkf_oracle", "saturated_dkf", "trimmed_consensus", "trust_dkf")
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(8)
 @pytest.mark.parametrize("place", ["thesis-ch5-v0", "weak", "platoon-braking-v0"])
 @pytest.mark.parametrize("defence", NAMES)
 def test_they_stay_finite_and_their_rows_do_not_depend_on_the_batch(defence, place):
@@ -277,6 +277,7 @@ def test_the_neighbours_of_an_attacked_agent_are_spared(defence):
 # --- Kalman consensus ---------------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_without_consensus_everybody_is_a_kalman_filter():
     """consensus_kf with gain 0 gives the estimates of kf, under attack and with readings lost; with the default it does not."""
     for place in ("thesis-ch5-v0", "platoon-braking-v0", "weak"):

@@ -175,6 +175,7 @@ def car_starts():
     return starts_of(arena("car"), "black", [], 0)
 
 
+@pytest.mark.long
 def test_a_policy_is_played_as_its_file_says(tmp_path, monkeypatch):
     """One program plays policies of any weights, to the bit of `evaluate`."""
     place = arena("car")
@@ -203,6 +204,7 @@ def test_starts(monkeypatch):
     assert [start.name for start in starts_of(place, "black", [script], 0, names[3:5])[:2]] == names[3:5]
 
 
+@pytest.mark.long
 def test_a_published_start_keeps_its_kinds(tmp_path):
     """A published policy that learned with fewer kinds than are granted goes on with its own, and its file says so."""
     place = arena("car")

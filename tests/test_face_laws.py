@@ -156,7 +156,7 @@ def test_rows_of_a_cell_share_nothing():
 COPIES = {"pickle": lambda env: pickle.loads(pickle.dumps(env)), "deepcopy": copy.deepcopy}
 
 
-@pytest.mark.thin(16)
+@pytest.mark.thin(31)
 @pytest.mark.parametrize("how", COPIES)
 @pytest.mark.parametrize("face", FACE_NAMES)
 @pytest.mark.parametrize("name, engine", PLAYED)

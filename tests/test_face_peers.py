@@ -103,7 +103,7 @@ def test_a_bad_limit_is_refused(bad):
         AdversaryVectorEnv(2, max_episode_steps=bad)
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(6)
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_information_has_one_set_of_names_and_types(name):
     """Single, vector and Stable-Baselines3's face: the same keys, and NumPy's types, so that a reader may ask for a dtype."""

@@ -124,6 +124,7 @@ def test_the_flag_says_what_surely_differs(alarms, said):
     assert drifts_of(_suite(alarms), "kf") == said
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize(("change", "field"), [
     ({"defence": "nobody"}, "defence"), ({"scenario": "away-v0"}, "scenario"), ({"onsets": 0}, "mean"), ({"mean": None}, "mean"), ({"low": -1.0}, "low"),
     ({"high": None}, "high"), ({"high": 9.0}, "high"), ({"first": 21}, "first"), ({"early": 11}, "early"), ({"running": 0.0}, "running"),

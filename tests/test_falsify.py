@@ -185,6 +185,7 @@ def test_a_schedule_plays_what_was_recorded():
         assert (trace.kind != 0).any() and trace.decision_hash(0) == again.decision_hash(0) and np.array_equal(trace.gap, again.gap)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("changes", "expected"), [
     ({"format": "x"}, "tailgate-counterexample-1"), ({"defence": 3}, "a text"), ({"seed": -1}, "not below 0"),
     ({"start": []}, None), ({"start": [{"role": "prior"}]}, "draws of a start"), ({"commands": {}}, "list of commands"),

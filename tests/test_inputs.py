@@ -103,7 +103,7 @@ FAMILIES = ("defence", *PARTS, "attack", "plant", "sensor", "controller", "manoe
 NAMES = [(family, name) for family in FAMILIES for name, entry in entries(family).items() if entry.built_in and name not in FILES and cases(entry.cls)]
 
 
-@pytest.mark.thin(6)
+@pytest.mark.thin(12)
 @pytest.mark.parametrize(("family", "name"), NAMES)
 def test_a_bad_number_is_refused_by_name_or_harmless(family, name):
     """Negative, zero, NaN, infinite, huge, tiny and reversed values of every numeric field of every registered component."""

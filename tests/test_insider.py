@@ -197,7 +197,7 @@ def growth(kp, kd, headway, tau, dt):
     return float(np.abs(np.linalg.eigvals(whole[:3, :3] + np.outer(whole[:3, 3], law))).max())
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("scale", [-0.1, -0.15, -0.25, -0.3])
 def test_the_gain_at_which_a_car_swings_is_the_closed_form(scale):
     """The first follower. Routh: tau s^3 + (1 + kd h) s^2 + (kd + kp h) s + kp is stable

@@ -137,6 +137,7 @@ def test_a_correction_is_that_of_matrices(q, batch, same_bits):
         assert same_bits(got[0], x + num.matvec(K, r * keep)) and same_bits(got[1], 0.5 * (after + num.transpose(after)))
 
 
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("defence", ["kf", "chi2_kf", "chi2_kf_sparse", "imm"])
 def test_filters_of_many_states_are_the_textbook_recursion(defence, monkeypatch, short, play, same_bits):
     """Functions of whole passes are products one after the other: five cars, each with 19 states, some of whose readings go missing."""

@@ -124,6 +124,7 @@ def test_an_error_has_no_unit_where_nothing_drives():
     assert [unit_in(name, network) for name in ("max_error", "rmse_position", "crashed")] == ["-", "-", "0/1"]
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("attack", ["fdi_ramp", "dos_jam"])
 def test_a_row_has_the_same_bits_whatever_its_companions(attack, short, play, same_bits):
     """Metrics of a seed alone, among 7 in another order, and among 64: equal bit for bit, undefined ones too."""

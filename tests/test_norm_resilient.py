@@ -75,7 +75,7 @@ def _objective(d, C, R, Q, r, lam):
     return lam * np.linalg.norm(w - np.einsum("pqn,bpn->bpq", M, d), axis=-1) + np.einsum("bpn,pnm,bpm->bp", d, Q, d)
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(5)
 @pytest.mark.parametrize("lam", LAMS)
 @pytest.mark.parametrize("family", FAMILIES)
 def test_the_estimate_is_optimal(family, lam):

@@ -63,6 +63,7 @@ def test_one_version_is_said_everywhere() -> None:
     assert own not in ALIKE and ALIKE[-1] == released[2][0]
 
 
+@pytest.mark.long
 def test_published_boards_are_of_versions_that_play_the_same() -> None:
     boards = [*(ROOT / "results").glob("*/board.json*"), *(ROOT / "configs/boards").iterdir()]
     assert len(boards) >= 10

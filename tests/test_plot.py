@@ -25,6 +25,7 @@ def trace_of(scenario: str, defence: str, attack: str) -> Trace:
     return rollout(loop, tailgate.make_attack(attack, start_step=10), keys("report", range(2)))
 
 
+@pytest.mark.long
 def test_matrices_and_scatter_show_every_cell(rows):
     some = [row for row in rows if row["dose"] == 20]
     figure = tailgate.plot.matrices(some, "twenty steps")

@@ -56,6 +56,7 @@ def test_vectors_repeat(form, start, tmp_path):
     assert {path.suffix for path in (tmp_path / "a").iterdir()} == {f".{form}"}
 
 
+@pytest.mark.long
 def test_the_command_draws(tmp_path, capsys):
     """tailgate evaluate --plot DIR names what it wrote; a directory that cannot be written is one clear error."""
     run = ["evaluate", "--scenario", "thesis-ch4-v0", "--defence", "kf", "--attack", "none", "--attack", "fdi", "--seeds", "4", "--dose", "none"]

@@ -57,7 +57,7 @@ def _policy(path: Path, action: dict[str, Any], knowledge: str = "black", seed: 
     return save_policy(path / "policy", network, header)
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(27)
 @pytest.mark.parametrize("interval", [1, 5])
 @pytest.mark.parametrize("knowledge", ["black", "white"])
 @pytest.mark.parametrize("action", ["timing", "mode", "ramp", "continuous", "increment"])

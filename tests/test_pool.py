@@ -11,6 +11,7 @@ def threads(name: str) -> str | None:
     return os.environ.get(name)
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("given", [{}, {"OPENBLAS_NUM_THREADS": "3"}, {"OMP_NUM_THREADS": "2"}])
 def test_workers_have_one_thread_each(given: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     for name in THREADS:

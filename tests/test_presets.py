@@ -20,6 +20,7 @@ from tailgate.training import train
 PRESETS = sorted(path.stem for path in (Path(__file__).parents[1] / "configs").glob("*.yaml"))
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_preset_can_be_played(name: str) -> None:
     """Scenario, defences, rivals, environment and learner of each fit together."""

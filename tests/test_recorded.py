@@ -153,7 +153,7 @@ def test_a_plant_that_begins_at_one_speed_is_refused():
         scenario.loop(Spec("defence", "kf").make())
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(6)
 @pytest.mark.parametrize("name", ["road-following-v0", "road-string-v0", "road-us06-v0", "road-aeb-own-v0", "road-aeb-shared-v0"])
 def test_the_engine_plays_the_same_bits(name):
     for defence, attack in (("chi2_kf", "fdi:start_step=105,value=10"), ("none", "dropout:start_step=110")):

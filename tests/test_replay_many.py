@@ -251,6 +251,7 @@ def test_the_picture_and_the_words_follow_the_slider(tab):
     assert not page.find_elements("css selector", "#plot-gap") and page.find_elements("css selector", "#plot-speed-error")
 
 
+@pytest.mark.long
 @pytest.mark.page
 def test_a_network_shows_the_errors_of_all(tab):
     """One curve for each agent on a logarithmic axis, the largest error to jump to, lanes for each attacked agent, and no road."""

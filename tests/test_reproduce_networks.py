@@ -92,7 +92,7 @@ def test_chapter_6_clean():
     assert np.quantile(ch6_cases.Played(trace).own[9].max(axis=1), 0.975) < 0.01
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(6)
 @pytest.mark.parametrize("guard", list(ch6_loop.DEFENCES))
 @pytest.mark.parametrize("label", list(DESIGN))
 def test_chapter_6_collisions(label, guard):

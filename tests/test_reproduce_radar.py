@@ -95,6 +95,7 @@ def test_verdicts_can_go_the_other_way(runs):
     assert ch3_cases._algorithm1(better).holds == "yes"
 
 
+@pytest.mark.long
 def test_the_radars_claims():
     """The signs are wrong as printed, a late echo shifts the distance, and a ratio below 1 alone denies nothing; a link can turn the last."""
     assert ch3_radar._signs().holds == "no" and ch3_radar._late().holds == "yes"

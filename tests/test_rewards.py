@@ -37,7 +37,7 @@ def _episode(interval=1, shaped=True, **options):
 
 @pytest.mark.parametrize("interval", [1, 5])
 @pytest.mark.parametrize("reward", ["collision", "min_gap", "error", "stealth"])
-@pytest.mark.thin(2)
+@pytest.mark.thin(6)
 def test_shaping_telescopes(reward, interval):
     """The discounted sum of what shaping adds is gamma^T Phi(end) - Phi(start), Phi(end) = 0 at a collision: no policy gains."""
     total, discount = np.zeros(8), 1.0

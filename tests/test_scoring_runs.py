@@ -39,6 +39,7 @@ def small():
         return part, evaluate(part)
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", SENTINELS)
 def test_each_sentinel_fails_the_gate_that_it_names(small, name) -> None:
     """And takes no rank; the two real defences pass every gate."""

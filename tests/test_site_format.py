@@ -22,6 +22,7 @@ spec.loader.exec_module(boards)
 make_board, network, HOSTILE, LONG = boards.make_board, boards.network, boards.HOSTILE, boards.LONG
 
 
+@pytest.mark.thin(4)
 @pytest.mark.parametrize(
     ("change", "field"),
     [

@@ -42,7 +42,7 @@ def alike(one: Any, two: Any) -> None:
     assert got.dtype == np.asarray(two).dtype and np.array_equal(got, two)
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=needs_compiler)])
 @pytest.mark.parametrize("kind", KINDS)
 def test_values_are_those_of_make_vec(kind: str, device: str, tmp_path: Any, host_card: HostCard) -> None:
@@ -103,6 +103,7 @@ def test_nothing_is_copied(host_card: HostCard) -> None:
     assert sheet.ctypes.data <= observation.data_ptr() < sheet.ctypes.data + sheet.nbytes
 
 
+@pytest.mark.long
 @needs_compiler
 def test_the_example_trains(host_card: HostCard, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """PPO in one file, on either device: the same lines but for the time."""

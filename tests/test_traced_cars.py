@@ -117,7 +117,7 @@ RADARS = [
 ]
 
 
-@pytest.mark.thin(20)
+@pytest.mark.thin(33)
 @pytest.mark.parametrize(("scenario", "defence", "attack", "threat"), [(*cell, {}) for cell in CARS + STEALTH] + RADARS)
 def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack, threat):
     trace_as_plain(*loop_of(scenario, defence, attack, **threat))

@@ -138,6 +138,7 @@ def test_strings_of_any_length(followers, tmp_path):
     assert fast.trace_hash(0) == plain.trace_hash(0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("terminate", [pytest.param(True, marks=pytest.mark.long), False])
 def test_whole_episodes_with_collisions_and_beyond_them(terminate):
     """To the horizon, ended by a collision or not."""

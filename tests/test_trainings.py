@@ -140,6 +140,7 @@ def test_two_interrupts_end_a_training_too(tmp_path: Path, gap: float) -> None:
     assert len(workers) >= 2 and not dying.left(workers)
 
 
+@pytest.mark.long
 def test_a_run_is_set_aside_when_its_turn_comes(tmp_path: Path) -> None:
     """Two runs are there, and another training is asked for and stopped at once: the second one's directory is as it was."""
     configs = [plan(tmp_path, name, "seeds=1", "steps=600") for name in ("first", "second")]

@@ -83,6 +83,7 @@ def test_a_finished_search_trains_nothing_and_more_trials_add_to_it(straight: tu
         tuning.tune(dataclasses.replace(search, trials=5))
 
 
+@pytest.mark.long
 def test_a_search_of_another_configuration_is_refused(straight: tuple[tuning.Search, dict[str, Any]]) -> None:
     """Its trials would be compared with others' outcomes."""
     search, _ = straight
