@@ -354,9 +354,9 @@ def test_a_restarted_row_is_a_fresh_one(text, same_tree):
 
 def test_any_filter_predicts(tmp_path, monkeypatch):
     """A name, a mapping, or somebody else's class; a wrong one fails where the defence is made."""
-    (tmp_path / "mine.py").write_text("from tailgate.estimators import HoldLast\n\nclass Mine(HoldLast):\n    '''As it is.'''\n", encoding="utf-8")
+    (tmp_path / "held_filter.py").write_text("from tailgate.estimators import HoldLast\n\nclass Mine(HoldLast):\n    '''As it is.'''\n", encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
-    one, two = (played(f"{FIXED},filter={name}", JAM, 4) for name in ("hold_last", "mine:Mine"))
+    one, two = (played(f"{FIXED},filter={name}", JAM, 4) for name in ("hold_last", "held_filter:Mine"))
     assert [one.trace_hash(i) for i in range(4)] == [two.trace_hash(i) for i in range(4)]
     made = Spec("defence", "cra:filter=polynomial,filter.degree=1").make()
     assert made.predictor().degree == 1 and Spec("defence", "cra:filter.window=12").make().predictor().window == 12
