@@ -12,8 +12,8 @@ docs: $(VENV)/.docs  ## the documentation as a site, boards and replays with it:
 	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet --jobs 2 --doctree-dir build/doctrees docs site
 	@echo 'site/index.html'
 
-test test-long: export OPENBLAS_NUM_THREADS = 1
-test test-long: export OMP_NUM_THREADS = 1
+short-tests test-long: export OPENBLAS_NUM_THREADS = 1
+short-tests test-long: export OMP_NUM_THREADS = 1
 
 test: $(VENV)/.ready  ## lint, types, tests, side by side; a thread in each of two processes
 	@$(MAKE) --no-print-directory --jobs 2 lint short-tests

@@ -21,6 +21,7 @@ from tailgate.core.draws import keys
 from tailgate.core.kinds import KindName
 from tailgate.core.registry import entries
 from tailgate.core.scenario import load_scenario
+from tailgate.play import trace
 from tailgate.play.trace import rollout
 
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # hundreds of commands are started: each would compile the package
@@ -76,6 +77,14 @@ def same_tree():
         return [name for name in one if not _same_bits(one[name][rows], two[name])]
 
     return differing
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    """Attacks are played by compiled code too, however few steps: it has the bits of plain code, and costs less where it plays again."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trace, "MANY", 1)
+        yield
 
 
 @pytest.fixture(scope="session")

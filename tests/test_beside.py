@@ -22,7 +22,6 @@ from tailgate.evaluation.attack_list import Admitted
 from tailgate.evaluation.cells import cells_of, run
 from tailgate.evaluation.paired import settled
 from tailgate.evaluation.rows import encode
-from tailgate.play import trace
 
 spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
 assert spec is not None and spec.loader is not None
@@ -298,12 +297,6 @@ def test_hits_that_are_not_of_the_cell() -> None:
 
 
 TEXT = "about: s\nscenarios: [thesis-ch4-v0]\ndoses: [5]\ndefences: [none, kf, chi2_kf]\nattacks: [none, 'fdi:value=5']\nseeds: 4\n"
-
-
-@pytest.fixture
-def compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Attacks are played by compiled code too, which has the bits of plain code."""
-    monkeypatch.setattr(trace, "MANY", 1)
 
 
 def _run(*arguments: str) -> None:

@@ -1,10 +1,10 @@
 """A board that grows, where all that rows can be is in it: two scenarios, every knowledge, optima, failures, errata, classes that change."""
 
+import copy
 import dataclasses
 import functools
 import importlib.util
 import json
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -57,12 +57,12 @@ def _rows(*guards: str, uses: dict[str, list[str]] = USES) -> list[Data]:
 
 
 @functools.cache
-def _made(*guards: str) -> bytes:
-    return pickle.dumps(dict(board(_rows(*guards), SUITE, attacks=LINES)))
+def _made(*guards: str) -> Data:
+    return dict(board(_rows(*guards), SUITE, attacks=LINES))
 
 
 def _whole(*guards: str) -> Data:
-    return dict(pickle.loads(_made(*guards)))
+    return copy.deepcopy(_made(*guards))
 
 
 def _as_read(made: Data) -> Data:

@@ -6,7 +6,6 @@ import dataclasses
 import json
 import sys
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,6 @@ from tailgate.cli import check as command
 from tailgate.core.scenario import load_suite
 from tailgate.evaluation.cells import cells_of, run
 from tailgate.evaluation.rows import encode
-from tailgate.play import trace
 from tailgate.site.build import build_site
 
 ROOT = Path(__file__).parents[1]
@@ -33,12 +31,7 @@ SUITE = dataclasses.replace(
 Data = dict[str, Any]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def compiled() -> Iterator[None]:
-    """Attacks are played by compiled code too: it has the bits of plain code, and the same few cells are played in every test."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trace, "MANY", 1)
-        yield
+pytestmark = pytest.mark.usefixtures("compiled")
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ import json
 import math
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,6 @@ from tailgate.board.score import score
 from tailgate.cli import main
 from tailgate.core.scenario import load_scenario, load_suite
 from tailgate.evaluation.cells import cells_of, run
-from tailgate.play import trace
 
 Data = dict[str, Any]
 QUICK = load_suite("quick-v0")
@@ -30,12 +28,7 @@ EFFORT = Effort((0.02, 0.05), 8, 20, 60_000)
 ATTACKS = ("dos_jam:trigger=near,threshold=40", "fdi:trigger=near,threshold=30,value=-4")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def compiled() -> Iterator[None]:
-    """Attacks are played by compiled code too, which has the bits of plain code: few steps are played, but by many loops."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trace, "MANY", 1)
-        yield
+pytestmark = pytest.mark.usefixtures("compiled")
 
 
 @pytest.fixture(scope="module")

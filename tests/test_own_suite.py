@@ -1,4 +1,4 @@
-"""A suite of one's own, of scenarios in files: rows and boards have the scenarios' names."""
+"""A user's suite whose scenarios are files: its rows and boards have the names of the scenarios, not the paths."""
 
 import json
 from pathlib import Path

@@ -66,7 +66,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shrink_ensemble(patch)
         patch.chdir(folder)
         patch.setattr(networks, "zoo_names", lambda: ["radar-following-kf-0"])
-        for name in ("braking", "heavy"):  # 60 s of the published ones, as files of one's own
+        for name in ("braking", "heavy"):  # files with the first 60 s of published scenarios
             data = yaml.safe_load((ROOT / "configs" / "scenarios" / f"radar-{name}-v0.yaml").read_text()) | {"horizon": 60}
             data["threat_model"]["end"] = 55
             if name == "braking":

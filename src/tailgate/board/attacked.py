@@ -10,7 +10,7 @@ from typing import NamedTuple
 from tailgate.base.errors import InputError
 from tailgate.base.progress import cells
 from tailgate.core.registry import Spec
-from tailgate.core.scenario import Suite, load_scenario
+from tailgate.core.scenario import Suite, name_of
 from tailgate.evaluation.cells import evaluate
 from tailgate.sandbox import play_submission
 from tailgate.training.adaptive import configs_of, fitting, plan_of, policies_of, stem, train_against
@@ -46,7 +46,7 @@ def attack(
     changes = (*changes, f"workers={workers}")
     configs = configs_of(suite, defence, out / "policies", seeds=seeds, extra=changes) if plan.learners else []
     policies = train_against(configs, progress)
-    places = {load_scenario(name).name: name for name in suite.scenarios}  # which may be files
+    places = {name_of(text): text for text in suite.scenarios}  # which may be files
     groups: dict[tuple[tuple[str, ...], str], list[str]] = {}  # a policy plays where the attacker sees and may do what it learned with
     for config in configs:
         groups.setdefault((fitting(suite, config), ""), []).extend(map(str, policies_of(config)))
@@ -57,7 +57,7 @@ def attack(
         groups = {key: texts for key, texts in groups.items() if texts}
     files, count, counted = [], 0, counting(progress)
     for (scenarios, kind), attacks in groups.items():
-        place = f"-{load_scenario(scenarios[0]).name}" if len(groups) > 1 else ""
+        place = f"-{name_of(scenarios[0])}" if len(groups) > 1 else ""
         files.append(out / f"{stem(defence)}{place}{kind}.jsonl")
         part = dataclasses.replace(suite, scenarios=scenarios, attacks=tuple(attacks))
 

@@ -16,12 +16,12 @@ from tailgate.base.locks import alone
 from tailgate.base.pool import apart, each
 from tailgate.base.version import VERSION
 from tailgate.core.registry import Spec
-from tailgate.core.scenario import Suite
+from tailgate.core.scenario import Suite, name_of
 from tailgate.evaluation.checks import Finding, Unplayable, again, differences, drawn, refused, sampling
 
 from .check import VERDICTS
 from .consistency import same
-from .detection import EFFORT, Effort, Progress, detection, name_of, plants, stealth_impact
+from .detection import EFFORT, Effort, Progress, detection, plants, stealth_impact
 from .false_alarms import false_alarms
 from .files import agree, amended, known, load, read_board, save, suite_of
 from .schema import DETECTION, Data

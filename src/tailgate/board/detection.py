@@ -21,7 +21,7 @@ from tailgate.base import sizes
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, draws
 from tailgate.core.registry import Spec
-from tailgate.core.scenario import Suite, load_scenario
+from tailgate.core.scenario import Suite, load_scenario, name_of
 from tailgate.core.score_threshold import Watched
 from tailgate.evaluation.attack_free import Bench
 from tailgate.evaluation.calibrate import Calibration, calibrate
@@ -72,12 +72,6 @@ def plants(scenarios: Sequence[str]) -> dict[str, tuple[str, ...]]:
     kinds = [kind for kind, _ in out]
     shape = "{} of {} agents with {} states and {} readings each"
     return {kind if kinds.count(kind) == 1 else shape.format(kind, *size): tuple(names) for (kind, size), names in out.items()}
-
-
-@functools.lru_cache(maxsize=256)
-def name_of(scenario: str) -> str:
-    """Return the name of a suite's scenario, as boards have it: that of a file is not its path."""
-    return load_scenario(scenario).name
 
 
 @functools.lru_cache(maxsize=256)

@@ -18,7 +18,7 @@ from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.version import VERSION
 from tailgate.core import Array, draws
 from tailgate.core.registry import Spec
-from tailgate.core.scenario import Scenario, Suite
+from tailgate.core.scenario import Scenario, Suite, name_of
 from tailgate.core.schema import fields_of
 from tailgate.evaluation.cells import Cell
 from tailgate.evaluation.checks import refused
@@ -136,7 +136,8 @@ def _inflation(board: Data, suite: Suite, scenario: str, defence: str, factor: f
 def _harm(board: Data, suite: Suite, cell: Data, factor: float) -> Array:
     """Return (n,) bool: the episodes of a cell that come to damage behind a controller with a longer headway."""
     attack = Spec("attack", cell["attack"])
-    made = Cell(suite.name, cell["scenario"], cell["dose"], REFERENCE, cell["attack"], 1, threat=suite.granted)
+    scenario = next(text for text in suite.scenarios if name_of(text) == cell["scenario"])
+    made = Cell(suite.name, scenario, cell["dose"], REFERENCE, cell["attack"], 1, threat=suite.granted)
     place = made.place(attack.make(), attack.entry.knowledge)
 
     def distances() -> dict[int, float]:

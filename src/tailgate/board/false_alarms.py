@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from tailgate.core import Array, draws
-from tailgate.core.scenario import Suite
+from tailgate.core.scenario import Suite, name_of
 from tailgate.evaluation.attack_free import HOUR, Bench, Count, count_onsets, side_by_side
 from tailgate.evaluation.rounds import numbered
 
-from .detection import name_of, plants
+from .detection import plants
 from .schema import Data
 
 PURPOSE = "report"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
@@ -209,6 +210,12 @@ def load_scenario(source: ScenarioLike) -> Scenario:
         raise InputError("scenario", source, "a name, a YAML file, a mapping of fields, or an object")
     path = config_path("scenarios", str(source), "scenario")
     return _made(_read_scenario(path, f"scenario {path.stem}"), path)
+
+
+@functools.lru_cache(maxsize=256)
+def name_of(scenario: str) -> str:
+    """Return the name of a suite's scenario, as rows and boards have it: that of a file is not its path."""
+    return load_scenario(scenario).name
 
 
 def _made(data: dict[str, Any], path: Path) -> Scenario:
