@@ -39,6 +39,7 @@ def command(law, d, dv, v=20.0, steps=1, mode=Mode.NORMAL, ahead=0.0):
     return out
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("late", [0, 1, 3])
 def test_the_model_makes_up_for_the_latency(late):
     """A reading is what was `late` cycles ago plus noise, and the innovation of a filter that is told so has its variance."""
@@ -162,6 +163,7 @@ def test_components_that_do_not_fit_are_refused():
         make("controller", "acc_production").prepare(load_scenario("stop-and-go-v0").brief().model)
 
 
+@pytest.mark.long
 def test_a_string_is_shown_behind_its_leader(tmp_path):
     """In pictures and on the page of a replay the leader is a car of its own, and the first agent is car 0."""
     pytest.importorskip("pygame")

@@ -31,6 +31,7 @@ def test_every_learner_is_trained_at_every_knowledge(tmp_path: Path) -> None:
     assert configs_of(SUITE, "kf", tmp_path, seeds=1, extra=("steps=40",))[0].steps == 40
 
 
+@pytest.mark.long
 def test_policies_play_as_attacks_and_are_trained_once(tmp_path: Path) -> None:
     """A second call trains nothing; the policies play on every scenario of the suite, as learned attacks of their own knowledge."""
     configs = configs_of(SUITE, "kf", tmp_path, extra=("workers=1",))

@@ -53,6 +53,7 @@ def test_an_agent_that_is_not_granted_is_refused(sends):
     np.testing.assert_array_equal(trace.wires, trace.clean)
 
 
+@pytest.mark.long
 def test_without_agents_a_script_hits_all_that_are_granted(sends):
     """The threat model's, or everybody."""
     assert hit(sends("fdi")).all()
@@ -199,7 +200,7 @@ GUARDS = ["chi2_dkf", "chi2_dkf:gain=steady", "chi2_kf", "composed:filter=dkf,de
 @pytest.mark.parametrize("defence", GUARDS)
 @pytest.mark.parametrize("scenario, index, least", [("platoon-braking-v0", 0, 0.5), ("platoon-braking-v0", 1, 0.3), ("thesis-ch5-v0", 3, 0.5)])
 @pytest.mark.parametrize("sign", [-1, 1])
-@pytest.mark.thin(10)
+@pytest.mark.thin(20)
 def test_stealth_pushes_each_agent_up_to_its_own_gate(defence, scenario, index, least, sign, short, play):
     """Every attacked agent is moved in the wanted sense by more than noise would, and never alarms in an attacked step."""
     agents = (1, 3) if scenario == "platoon-braking-v0" else (0, 4, 7)

@@ -77,6 +77,7 @@ def _assert_equal(state, outcome, stick, rear):
         np.testing.assert_allclose(stick.row(name), values, rtol=1e-9, atol=1e-9, err_msg=name)
 
 
+@pytest.mark.long
 @needs_compiler
 def test_the_yardstick_drives_as_the_loop_does():
     """Every state, covariance and reward of 64 episodes over 330 steps, random numbers, gate, injection and phases of the leader included."""

@@ -77,6 +77,7 @@ def _without_hits(made: Data) -> Data:
     return held
 
 
+@pytest.mark.long
 def test_what_a_board_does_not_know_makes_ranks_wider_and_never_wrong() -> None:
     """Pairs that stay keep what was found of them when all was known; new pairs count as different as numbers of hits allow."""
     hits = {"none": 20, "kf": list(range(13)), "rkf": [0, 19], "imm": [3, 4, 5], "safe_state": 1}
@@ -306,6 +307,7 @@ def _run(*arguments: str) -> None:
     assert options.run(options) == 0
 
 
+@pytest.mark.long
 def test_the_command(compiled: None, tmp_path: Path) -> None:
     """A board that is there grows by an entry; without the flag it is one of the rows alone."""
     file, out = tmp_path / "small-v0.yaml", tmp_path / "out"

@@ -92,6 +92,7 @@ def test_rows_beside_a_board_make_what_all_rows_make(guards: tuple[str, ...]) ->
     assert board(_rows("none", *guards), SUITE, attacks=LINES, board=_as_read(whole)) == whole
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("guard", ["kf", "safe_state", "brake_kf"])
 def test_an_entry_that_changes_its_class(guard: str) -> None:
     """Ranks of the class that it left, and of the one that it joined, are made again."""

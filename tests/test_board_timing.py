@@ -110,6 +110,7 @@ def test_the_cell_that_is_nearest_to_a_half_speaks_for_an_entry() -> None:
     assert telling({"attacks": lines, "cells": even}, "kf") == even[1] and "did damage" in telling({"attacks": lines, "cells": [cell(here.format(0), 5, 0.0)]}, "kf")
 
 
+@pytest.mark.long
 def test_a_cell_that_says_something_else_is_not_believed(board: Data) -> None:
     """Nor is it where it does not say which episodes came to damage; a defence that is not on the board is refused."""
     changed = copy.deepcopy(board)

@@ -75,6 +75,7 @@ def test_the_jump_grows_while_the_gate_is_shut(model):
     assert (np.diff(seen) > 0).all()
 
 
+@pytest.mark.long
 @pytest.mark.thin(5)
 @pytest.mark.parametrize("index", [0, 1])
 @pytest.mark.parametrize("steps", [1, 5, 40])

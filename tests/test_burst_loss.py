@@ -37,6 +37,7 @@ def runs(series):
     return [b - a for a, b in edges.reshape(-1, 2) if a > 0 and b < len(series)]
 
 
+@pytest.mark.long
 def test_bursts_have_the_chains_statistics():
     """Gilbert's channel (all lost in the bad state): the share of losses is fail / (fail + recover), a burst lasts 1 / recover steps."""
     trace = play(BurstLoss(fail=0.03, recover=0.15), range(64), terminate=False)

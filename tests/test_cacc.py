@@ -201,6 +201,7 @@ def test_laws_are_refused_without_a_platoons_messages(name):
     assert load_scenario("platoon-v2v-v0").brief().model.v2v == V2V
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", LAWS)
 @pytest.mark.thin(4)
 def test_cars_that_fall_back_stop_behind_a_leader_that_brakes(name):

@@ -109,6 +109,7 @@ def test_a_calibrated_threshold_holds_on_fresh_runs(defence, roads):
         assert done.threshold == pytest.approx(2.0 * math.log(3600.0), abs=0.5)
 
 
+@pytest.mark.long
 def test_a_long_mean_time_is_found_on_fewer_alarms(roads):
     """Where a run would take too many steps it is cut, and the interval says what that leaves; with too few alarms it is refused."""
     done = calibrate("composed:detector=chi2,mitigation=accept_all", 0.2, scenarios=roads[:1], onsets=400, most_steps=180_000)
@@ -216,6 +217,7 @@ def _of_fifty(defence, roads):
     return calibrate(defence, 0.02, scenarios=roads, onsets=50, most_steps=200_000)
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("how", ["p", "negative"])
 def test_scores_that_are_crowded_or_negative_have_thresholds(how, roads):

@@ -124,6 +124,7 @@ def test_of_several_starts_the_best_goes_on(brief):
     np.testing.assert_array_equal(race.sd, best.sd)
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("generations", [2, 3, 5, 9, 10])
 def test_a_search_that_is_interrupted_between_its_starts(brief, generations, tmp_path):
     """Stopped within a trial, at its end or after the last: resumed, it comes to the same policy."""

@@ -69,6 +69,7 @@ def onset_of(trace):
 # --- the thesis's case study, 200 seeds ---
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("attack", [JAM, LATE])
 def test_scenario_one_is_survived_with_the_joint_regression(attack):
     """Both attacks are detected at 182, no run collides, the gap's error over the attack is about 0.14 m, and the last gap 5.03 m."""
@@ -78,7 +79,7 @@ def test_scenario_one_is_survived_with_the_joint_regression(attack):
     assert np.median(trace.gap[-1]) == pytest.approx(5.03, abs=0.01)
 
 
-@pytest.mark.thin(5)
+@pytest.mark.thin(10)
 @pytest.mark.parametrize("defence", ["none", "algorithm2", f"{FIXED},filter=hold_last", "pycra:challenge=fixed", f"{FIXED},watch=none,freeze=false"])
 @pytest.mark.parametrize("attack", [JAM, LATE])
 def test_scenario_one_collides_in_every_run_without_it(attack, defence):
@@ -103,6 +104,7 @@ def test_a_list_that_the_attacker_knows_loses(onset):
     assert crashed(trace).all() and not trace.alarm[trace.live].any()
 
 
+@pytest.mark.long
 def test_random_challenges_lose_to_the_thesis_jammer_only_where_they_come_late():
     """With p = 0.1 it takes 9 steps on average, and a reading of 180 m and more is fatal after some 6: those who challenge sooner survive."""
     trace = played("cra", JAM)
@@ -119,6 +121,7 @@ def test_a_challenge_that_a_doubtful_reading_prompts_comes_in_time(attack):
     assert not crashed(trace).any() and (onset_of(trace) <= (183 if attack == JAM else 195)).all()
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("at, error", [(60, 0.33), (100, 0.82)])
 def test_scenario_two_needs_the_reset(at, error):
     """A leader that changes from -0.1082 to +0.012 m/s^2 well before the attack is predicted with the reset, and not without."""
@@ -247,6 +250,7 @@ def test_no_false_alarm_in_the_closed_loop_at_one_in_a_million():
     assert np.count_nonzero(~trace.probe) > 29_000 and not trace.alarm.any() and not crashed(trace).any()
 
 
+@pytest.mark.long
 def test_an_attacker_who_falls_silent_in_time_is_not_heard():
     """With no reaction time an attacker is never detected, and its 6 m end in a collision; with one of 0.1 s, the window, it is."""
     place = place_of().with_threat(reaction=0.0)
@@ -255,6 +259,7 @@ def test_an_attacker_who_falls_silent_in_time_is_not_heard():
     assert (onset_of(played(FIXED, LATE, 50, place_of().with_threat(reaction=0.1))) == 182).all()
 
 
+@pytest.mark.long
 def test_the_watch_and_the_list():
     """Fixed challenges come at their steps alone; watch adds its share of the alarmed steps, none of them with none."""
     quiet = played(f"{FIXED},times=[2,7,300]", "none", 3)
@@ -267,6 +272,7 @@ def test_the_watch_and_the_list():
     assert (~trace.probe[40:]).mean() == pytest.approx(0.1, abs=0.01) and trace.alarm[40:].mean() > 0.95
 
 
+@pytest.mark.long
 def test_the_mode_outlasts_the_alarm_by_the_linger():
     """While alarmed, and 3 s after, the controller is asked to brake; the car is then slower than without."""
     trace = played(f"{FIXED},watch=1,quiet=1,mode=brake,linger=3", "radar_jam:start_step=182,length=10", 5)
@@ -275,6 +281,7 @@ def test_the_mode_outlasts_the_alarm_by_the_linger():
     assert (trace.speed[192] < played(FIXED, "radar_jam:start_step=182,length=10", 5).speed[192] - 1.0).all()
 
 
+@pytest.mark.long
 def test_detection_alone_leaves_the_readings_alone():
     """pycra drives on every reading, attacked ones too, and predicts at challenges; no attack, no difference from cra."""
     attacked, clean, other = played("pycra", LATE, 30), played("pycra", "none", 30), played("cra", "none", 30)
@@ -322,7 +329,7 @@ def test_looking_ahead_shows_what_a_step_does():
                 assert (moved[dead] == 0.0).all() and dead.any() == (not trace.probe[k - 1].all() or (k == 33 and text[:3] == "cra"))
 
 
-@pytest.mark.thin(6)
+@pytest.mark.thin(12)
 @pytest.mark.parametrize("text", ["cra", FIXED, "cra:filter=kf,suspicion=20", "cra:filter=polynomial", "cra:filter=autoregressive", "pycra", "algorithm2"])
 def test_rows_do_not_depend_on_their_batch(text):
     """trace_hash of a seed is the same alone and among others, under attack, alarm and roll-back."""

@@ -76,12 +76,13 @@ def published() -> Data:
 
 
 @pytest.mark.parametrize("name", sorted(path.parent.name for path in ROOT.glob("results/*/board.json*")))
-@pytest.mark.thin(11)
+@pytest.mark.thin(22)
 def test_what_is_published_follows_from_its_cells(name: str) -> None:
     board = load(board_in(ROOT / f"results/{name}"))
     assert strays(board, load_suite(name)) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("field", ["rates", "critical_dose"])
 def test_figures_of_another_entry_are_named(published: Data, field: str) -> None:
     entries = {entry["defence"]: entry for entry in published["entries"]}
@@ -90,6 +91,7 @@ def test_figures_of_another_entry_are_named(published: Data, field: str) -> None
     assert [(line["defence"], line["field"]) for line in report["strays"]] == [("kf", field)] and not report["scored"]
 
 
+@pytest.mark.long
 def test_limits_doses_and_curves_follow_too(published: Data) -> None:
     changed = [copy.deepcopy(published) for _ in range(4)]
     changed[0]["cells"][1]["damage"]["high"] = 0.5

@@ -50,6 +50,7 @@ class Slow:
         return self.inner.step(*arguments)
 
 
+@pytest.mark.long
 def test_what_is_timed_is_the_step_of_the_defence_alone() -> None:
     """Two milliseconds more in its step count, and in the controller beside it they do not."""
     place = load_scenario("thesis-ch4-v0")
@@ -62,6 +63,7 @@ def test_what_is_timed_is_the_step_of_the_defence_alone() -> None:
     assert copy.copy(kf).taken == kf.taken
 
 
+@pytest.mark.long
 def test_the_defences_of_a_suite_are_timed_in_turn() -> None:
     """Each has a median between its least and its largest round; who means nothing in the scenario is left out, and refused by name."""
     told: list[tuple[int, int]] = []

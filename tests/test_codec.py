@@ -131,7 +131,7 @@ def test_the_published_policies_still_fit(number):
 # -- observations of many agents
 
 
-@pytest.mark.thin(4)
+@pytest.mark.thin(8)
 @pytest.mark.parametrize("knowledge, sees", [("black", False), ("grey", False), ("white", False), ("black", True)])
 @pytest.mark.parametrize("kind", PLACES)
 def test_observations_are_finite_named_and_of_a_sensible_size(kind, knowledge, sees):

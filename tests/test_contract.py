@@ -66,7 +66,7 @@ def test_every_defence_applies_somewhere():
         load_scenario(PLACE[name]).loop(tailgate.make_defence(name), entries("defence")[name].uses)
 
 
-@pytest.mark.thin(20)
+@pytest.mark.thin(40)
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_rows_of_a_defence_do_not_depend_on_their_batch(defence, short, play):
     """trace_hash of each seed is the same in batches of 1, 7 and 64, in which some readings are falsified and others jammed."""
@@ -83,7 +83,7 @@ def test_rows_of_an_attack_do_not_depend_on_their_batch(attack, short, play):
     _batches(lambda seeds: _play(play, short(budget=20, duration=7, cooldown=2), "chi2_kf", attack, seeds, terminate=False))
 
 
-@pytest.mark.thin(19)
+@pytest.mark.thin(29)
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_rows_of_a_scenario_do_not_depend_on_their_batch(name, short, play):
     """trace_hash of each seed is the same in batches of 1, 7 and 64, collisions included; of many agents in 1, 2 and 6, for fewer steps."""
@@ -96,7 +96,7 @@ def test_rows_of_a_scenario_do_not_depend_on_their_batch(name, short, play):
     assert [some.trace_hash(0), some.trace_hash(1), alone.trace_hash(0)] == [known[5], known[2], known[4]]
 
 
-@pytest.mark.thin(15)
+@pytest.mark.thin(30)
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_outputs_are_finite_and_of_the_right_shape(defence, short, loop_of):
     """Without an attack and under every kind, with the widest jammer, a defence returns finite arrays of the declared shapes and types."""
@@ -183,7 +183,7 @@ def test_swapping_the_defence_leaves_the_world_draws(defence, short, play, monke
     np.testing.assert_allclose(noise[0][heard], noise[1][heard], atol=1e-2 if traces[0].model.air else 1e-9)
 
 
-@pytest.mark.thin(11)
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("batch", [1, 2, 3, 4, 10])
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_restart(defence, batch, short, loop_of, same_tree):
@@ -250,7 +250,7 @@ def test_a_white_box_may_look_ahead_at_will(defence, short, loop_of):
     assert [plain.trace_hash(i) for i in range(3)] == [curious.trace_hash(i) for i in range(3)]
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(6)
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_a_defence_gets_only_what_its_card_declares(defence, short):
     """The loop fills V2V, odometry and the truth about the attack only for those who declare them."""

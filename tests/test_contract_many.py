@@ -56,7 +56,7 @@ def slow(defence):
 each = pytest.mark.parametrize("defence, place", [(d, p) for p in PLACES for d in DEFENCES])
 
 
-@pytest.mark.thin(19)
+@pytest.mark.thin(38)
 @each
 def test_a_defence_runs_and_its_rows_do_not_depend_on_their_batch(defence, place):
     """Finite arrays of the declared shapes, and the same trace_hash in batches of 1, 3 and 16, while readings are falsified and lost."""
@@ -80,7 +80,7 @@ def test_a_defence_runs_and_its_rows_do_not_depend_on_their_batch(defence, place
     assert [some.trace_hash(0), some.trace_hash(1), alone.trace_hash(0)] == [known[2], known[0], known[1]]
 
 
-@pytest.mark.thin(4)
+@pytest.mark.thin(10)
 @each
 def test_a_restarted_row_is_a_fresh_one(defence, place, same_tree):
     """Restarted rows equal fresh rows of the next episode and play on like them; the others keep every bit; every leaf has B first."""
@@ -143,7 +143,7 @@ def _spoil(thing, seen):
 
 
 @pytest.mark.parametrize("attack, place", [(a, p) for p in PLACES for a in ATTACKS])
-@pytest.mark.thin(7)
+@pytest.mark.thin(14)
 def test_an_attack_runs_within_what_is_granted(attack, place):
     """Its rows do not depend on their batch; before the onset, and ever after on the agents not granted, what is sent arrives."""
     loop = loop_of(place, "chi2_dkf")

@@ -202,6 +202,7 @@ def test_falsified_accelerations_collide_without_the_clip_and_not_with_it():
         assert not safe.collided.any() and safe.gap[:, :, 1:].min() > InputClip().clearance
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("sides", ["above", "both"])
 def test_the_command_stays_within_the_bound_of_the_own_law(sides):
@@ -325,7 +326,7 @@ def test_limits_reach_the_estimate_and_the_mode_lives_on():
         plain.prepare(loop.model).mitigation_plan, 2)), received, state.known_u, None)[1].limits is None  # fmt: skip
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("mitigation", [InputClip(), SlidingMode(when="always"), SlidingMode(linger=1.0), AccFallback()])
 def test_rows_do_not_depend_on_their_batch(mitigation):
     """trace_hash of each seed is the same alone and among others, with lost and falsified readings."""

@@ -149,7 +149,7 @@ def test_nothing_is_undefined_in_c(tmp_path: Any) -> None:
 OFTEN = ("elementwise", "types", "sparse", "dense", "inverses", "rare", "in a loop", "read in other places")
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(6)
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[] if name in OFTEN else [pytest.mark.long]) for name in buffers.CASES])
 def test_buffers(name: str, host_card: HostCard) -> None:
     function, batch = buffers.CASES[name], 137  # more warps than run at once: they share their rooms
@@ -210,6 +210,7 @@ ENVIRONMENTS = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("arguments", [pytest.param(one, marks=[pytest.mark.long] if i > 0 else [], id=f"{one['scenario']}, {one['defence']}") for i, one in enumerate(ENVIRONMENTS)])  # fmt: skip
 def test_environments(arguments: dict[str, Any], tmp_path: Any) -> None:
     as_plain(arguments, 67, tmp_path, device="cuda")
@@ -225,7 +226,7 @@ EPISODES = [
 ]
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("scenario, defence, attack, whole", [pytest.param(*one, marks=[pytest.mark.long] if i > 2 else []) for i, one in enumerate(EPISODES)])
 def test_whole_episodes(scenario: str, defence: str, attack: str, whole: bool) -> None:
     """Hashes of every signal: with the attack on the card, several steps a launch; and with the attack in plain code."""

@@ -59,6 +59,7 @@ def _problem(trial):
     return (O, Y) if np.linalg.matrix_rank(O[0].reshape(-1, n)) == n else _problem(trial)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("norm", [2, 1])
 @pytest.mark.thin(2)
 def test_the_decoder_is_as_good_as_an_interior_point_solver(norm):
@@ -226,6 +227,7 @@ def test_feasible_is_what_a_grid_finds():
         assert (x is not None) == (low <= high) and (x is None or low - 1e-9 <= x[0] <= high + 1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("centre", ["least_squares", "chebyshev"])
 def test_honest_errors_within_their_bounds_never_alarm_and_move_the_estimate_by_less_than_the_bound(centre):

@@ -80,6 +80,7 @@ def test_false_alarms_are_counted():
     assert row["hours"] == pytest.approx((1200.0 - 5.0) / 3600.0, rel=1e-3)
 
 
+@pytest.mark.long
 def test_an_attack_is_seen_or_not_and_the_delay_is_from_its_first_step():
     recording, _ = _recording()
     out, played = detect([recording], ["chi2_kf", "kf"], ["fdi:start_step=150,value=6", "fdi_ramp:start_step=150,rate=0.2"])
@@ -185,6 +186,7 @@ def test_a_recording_without_a_name_has_that_of_its_file(tmp_path, capsys):
     assert mapping_of(["gap=gap:m", "speed=v:raw"]) == (("gap", "gap", "m"), ("speed", "v:raw", ""))  # a column's name may have a colon
 
 
+@pytest.mark.long
 def test_replays_are_written(tmp_path):
     pytest.importorskip("pyarrow")
     recording, _ = _recording(seconds=60.0)

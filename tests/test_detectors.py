@@ -181,6 +181,7 @@ def test_the_gate_is_exact(detector):
     assert (shut > 0) == (isinstance(quick, WindowedChiSquare) or not quick.reset)
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("detector", STATEFUL, ids=repr)
 def test_stealth_is_as_loud_as_it_can_be_and_never_alarms(detector, short, play):
     """The white-box attack on the gate keeps the score just below the threshold; under MEWMA once it has turned z to where it pushes."""

@@ -157,6 +157,7 @@ def test_it_equals_a_plain_implementation(model, steady):
             np.testing.assert_allclose(state.filter.P[b], P, rtol=1e-6, atol=1e-6 * np.abs(P).max())
 
 
+@pytest.mark.thin(6)
 def test_the_varying_gain_settles_at_the_steady_one(model):
     """With all readings, predicted covariances and gains of the time-varying filter come to those of the steady filter."""
     _, _, _, state = play_filter(model, False, 600 if model.dt < 1.0 else 60, 1, loss=-1.0)
@@ -200,7 +201,7 @@ def with_plant(place, sensor=None, horizon=60, **plant):
     return changed.with_threat(agents=())
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("seed", range(5))
 def test_without_noise_the_errors_vanish(seed):
     """Theorem 5.3.2 on random systems and graphs; on the way max_i e_i' P_i^-1 e_i never grows (5.12)."""
@@ -242,6 +243,7 @@ def blind_by_hand(model):
     return [i for i in range(model.agents) if (np.abs(model.C[heard[i]].reshape(-1, model.states) @ last).max(axis=0) < 1e-9).any()]
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("gain", ["steady", "varying"])
 @pytest.mark.parametrize("directed", [False, True])

@@ -33,7 +33,7 @@ from .distributed import RNG, error, model_of, place_of, play, random_state
 NAMES = ("chi2_dkf", "consensus_kf", "disagreement_dkf", "dkf_oracle", "saturated_dkf", "trimmed_consensus", "trust_dkf")
 
 
-@pytest.mark.thin(8)
+@pytest.mark.thin(6)
 @pytest.mark.parametrize("place", ["thesis-ch5-v0", "weak", "platoon-braking-v0"])
 @pytest.mark.parametrize("defence", NAMES)
 def test_they_stay_finite_and_their_rows_do_not_depend_on_the_batch(defence, place):
@@ -52,7 +52,7 @@ def test_they_stay_finite_and_their_rows_do_not_depend_on_the_batch(defence, pla
         assert [some.trace_hash(0), alone.trace_hash(0)] == [known[3], known[4]]
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(6)
 @pytest.mark.parametrize("defence", [name for name in NAMES if name != "trimmed_consensus"])
 def test_without_attack_and_noise_they_converge(defence):
     """On the thesis's network and under weak sensing the errors vanish, faster or slower."""
@@ -64,6 +64,7 @@ def test_without_attack_and_noise_they_converge(defence):
 # --- the gate ---------------------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("gain", ["varying", "steady"])
 def test_a_gate_that_never_shuts_is_no_gate(gain, same_bits):
@@ -172,6 +173,7 @@ def test_saturation_counts_the_readings_that_are_used():
 # --- neighbours who disagree --------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("centre", ["median", "own"])
 def test_who_never_disagrees_is_fused_as_ever(centre, same_bits):
@@ -312,6 +314,7 @@ def test_consensus_is_the_papers_equation(share):
             np.testing.assert_allclose(got.P[b, i], np.linalg.inv(S), rtol=1e-7, atol=1e-7)
 
 
+@pytest.mark.long
 def test_shared_readings_on_a_complete_graph_are_all_readings():
     """With `share` and everybody in touch, each agent is the Kalman filter of all sensors."""
     place = place_of("weak")

@@ -133,7 +133,7 @@ def bits(x: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(held).view(f"u{held.dtype.itemsize}")
 
 
-@pytest.mark.thin(6)
+@pytest.mark.thin(12)
 @pytest.mark.parametrize("name", CASES)
 def test_numpys_bits(name: str) -> None:
     function, batch = CASES[name], 13

@@ -245,6 +245,7 @@ def test_a_still_observation_keeps_its_size():
     np.testing.assert_allclose(scales(seen), [0.01, 1.0, 1.0], rtol=1e-6)
 
 
+@pytest.mark.long
 def test_the_clean_distance_is_the_metric(monkeypatch):
     """The distances that an attacked run is judged by are those of the clean run, to the bit, in both engines."""
     place = dataclasses.replace(arena("car"), progress=0.5)

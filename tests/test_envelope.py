@@ -163,11 +163,13 @@ def alarms(text, scenario, attack, seeds, purpose="report", **threat):
     return trace, trace.alarm[..., 0] & trace.live
 
 
+@pytest.mark.long
 def test_no_alarm_in_the_runs_that_it_was_learned_from(learned):
     trace, alarm = alarms(f"envelope:path={learned},count=1", "stop-and-go-v0", "none", 2, "train")
     assert not alarm.any() and trace.score.max() <= 1.0 and trace.score.max() > 0.5
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("name", SHIPPED)
 def test_fresh_clean_runs_leave_no_invariant_too_often(name):

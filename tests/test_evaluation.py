@@ -105,6 +105,7 @@ PAIRS = [
 ]
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize(("how", "reason"), [("raise", "broken"), ("nan", "NaN"), ("shape", "score"), ("type", "alarm"), *PAIRS])
 def test_a_defence_that_fails_costs_its_own_rows_only(how: str, reason: str) -> None:
     rows = tailgate.evaluate(scenarios=[PLACE], defences=["kf", Faulty(how=how)], attacks=["none"], seeds=3)
@@ -262,6 +263,7 @@ def test_a_mode_that_does_not_exist_is_refused() -> None:
 PLATOON = Cell("s", "platoon-braking-v0", None, "none", "fdi:start_step=200,value=60,chance=0.5", 7)
 
 
+@pytest.mark.long
 def test_a_cell_plays_no_more_at_once_than_memory_holds(monkeypatch: pytest.MonkeyPatch) -> None:
     """The batch is cut where a trace would need more than trace.MEMORY; the rows do not change, nor do those of a cell that fails, words apart."""
     sizes: list[int] = []

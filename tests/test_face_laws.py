@@ -114,7 +114,7 @@ FACE_NAMES = ("single", "sb3", *AUTORESETS)
 PLAYED = [(name, engine) for name in SYSTEMS for engine in ("auto", "plain") if (name, engine) != (HIGHWAY, "plain")]
 
 
-@pytest.mark.thin(9)
+@pytest.mark.thin(18)
 @pytest.mark.parametrize("face", FACE_NAMES)
 @pytest.mark.parametrize("name, engine", PLAYED)
 def test_nothing_that_was_handed_out_is_used_again(name, engine, face, tiny):
@@ -301,6 +301,7 @@ def test_pictures_of_the_fast_engine_are_those_of_the_plain_loop(autoreset, brie
     assert ends >= 6 and fast.engine == "traced"
 
 
+@pytest.mark.long
 def test_a_single_environment_that_may_be_drawn_stays_fast():
     """As `make_vec_env` makes it: render_mode is set and nobody looks. The first picture, and each later one, is the plain loop's."""
     pytest.importorskip("PIL")

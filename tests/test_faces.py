@@ -79,7 +79,7 @@ def test_both_checkers_pass_without_a_warning(action, turn, knowledge, strict, b
         sb3.check_env(gymnasium.make(ID, **arguments), warn=True)
 
 
-@pytest.mark.thin(23)
+@pytest.mark.thin(46)
 @pytest.mark.parametrize("knowledge, sees", [("black", True), ("white", False)])
 @pytest.mark.parametrize("action", ACTIONS)
 @pytest.mark.parametrize("name", [RADAR, PLATOON, NETWORK])
@@ -167,7 +167,7 @@ def _actions(vec, steps, seed=0):
 SEEDED = [*((ID, action, interval) for action in ACTIONS for interval in (1, 3)), (PLATOON, "mode", 1), (PLATOON, "increment", 3), (NETWORK, "ramp", 3), (NETWORK, "continuous", 1)]
 
 
-@pytest.mark.thin(7)
+@pytest.mark.thin(14)
 @pytest.mark.parametrize("name, action, interval", SEEDED)
 def test_row_i_is_the_single_environment_of_seed_s_plus_i(name, action, interval, tiny, same_bits):
     """Two whole episodes: observation, reward, flags and info of every row, bit for bit; autoreset adds 1 to the episode."""
@@ -196,6 +196,7 @@ def test_row_i_is_the_single_environment_of_seed_s_plus_i(name, action, interval
         assert vec.unwrapped.episode[i] == episodes - 1 == env.unwrapped.batch.episode[0]
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_next_step_same_step_and_disabled_are_one_core(name, tiny, same_bits):
     """NEXT_STEP spends a step on the reset, SAME_STEP reports the last observation as final_obs, DISABLED waits for a mask."""

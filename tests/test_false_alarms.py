@@ -104,6 +104,7 @@ NONE = boards.gave(0, 20.0)
 NEARLY = boards.gave(54, 20.0, dispersion=1.0)  # limits of 95 % end at 0.493 h, of 98.3 % at 0.52
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize(("alarms", "said"), [
     ([CALM, BUSY | boards.gave(25, 20.0)], []),
     ([CALM, WORN | OFTEN], ["alarm drift: set to one false alarm in 1 h, it raises one in 11 s on worn-v0"]),

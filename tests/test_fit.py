@@ -25,6 +25,7 @@ def _made(windows=3, seconds=30.0, dt=0.1, delay=0.4):
     return fits.Windows(np.concatenate([lead[..., None], found.speed], axis=2), found.gap, dt)
 
 
+@pytest.mark.long
 def test_the_law_that_made_the_data_is_found():
     held, costs = _made(), []
     for car in range(2):

@@ -106,6 +106,7 @@ def test_sums_run_in_ascending_order(same_bits, shape):
     assert same_bits(fmcw_signal._in_order(x), out)
 
 
+@pytest.mark.long
 def test_a_large_batch_takes_no_more_memory_than_a_small_one():
     """Root-MUSIC of 128 sweeps allocates as much at its peak as that of 16, for which machine code is made before."""
     peaks = []
@@ -168,6 +169,7 @@ def test_service_is_denied_below_the_threshold():
         assert low <= share <= high
 
 
+@pytest.mark.long
 def test_both_paths_drive_the_car(same_bits):
     """The case study's first 40 s: the same truth behind both, readings 0.25 m and 0.1 m/s around it; a row alone equals its row of a batch."""
     place = load_scenario("thesis-ch3-v0")

@@ -35,6 +35,7 @@ def test_it_saturates_the_resilient_estimator_without_an_end():
     assert error[-1] > 5.0 * error[22] and error[-1] > 20.0
 
 
+@pytest.mark.long
 def test_grown_in_slowly_it_passes_a_gate_that_hears_it_at_once():
     """A jump alarms; the same size grown in over 30 steps does not, and moves the estimate."""
     jump, slow = (_run(tailgate.make_attack("ghost", size=90.0, grow=grow), "chi2_dkf") for grow in (0.0, 30.0))

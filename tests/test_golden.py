@@ -22,7 +22,7 @@ ALIKE = {f"{suite}-v0/{name}-v0" for suite, names in {
     "car-following": ("car-following-heavy", "car-following-light", "car-following-noisy", "car-following-late"),
     "quick": ("gusty-stop-and-go", "stop-and-go"),
     "ch3": ("thesis-ch3", "thesis-ch3-switched"),
-    "ch4-long": ("ornstein-uhlenbeck", "gusty-stop-and-go"),
+    "ch4-long": ("ornstein-uhlenbeck", "gusty-stop-and-go", "braking"),
     "ch4-actuator": ("braking",),
     "ch5": ("network-weak",),
     "ch6": ("platoon-braking",),
@@ -32,7 +32,8 @@ ALIKE = {f"{suite}-v0/{name}-v0" for suite, names in {
     "platoon": ("platoon-noisy", "platoon-heavy", "platoon-lossy"),
     "radar": ("radar-heavy",),
     "redundant": ("redundant-two", "redundant-three"),
-    "road-aeb": ("road-following", "road-us06"),
+    "road-aeb": ("road-following", "road-us06", "road-aeb-shared"),
+    "thesis": ("thesis-ch3", "thesis-ch3-switched"),
 }.items() for name in names}  # fmt: skip
 
 
@@ -42,7 +43,7 @@ def _alike(name: str) -> bool:
 
 
 def test_scenarios_that_are_alike_have_another_one() -> None:
-    """Each suite and each kind of plant has a scenario in every run, but the highway, of which a cell is played."""
+    """Each kind of plant, sensor and controller has a scenario in every run, but the highway, of which a cell is played."""
     assert set(HELD["scenarios"]) >= ALIKE
     place, played = (lambda name: load_scenario(name.partition("/")[2])), [name for name in HELD["scenarios"] if not _alike(name)]
     kinds = {(type(place(name).plant), type(place(name).sensor), type(place(name).controller)) for name in played}
@@ -88,6 +89,7 @@ def test_every_scenario_has_two_defences_and_three_attacks() -> None:
         assert all(len(set(traces)) == count for traces in by_defence), name  # each attack takes effect
 
 
+@pytest.mark.long
 def test_a_fingerprint_is_of_the_rows_of_a_board() -> None:
     """Played in one batch with other attacks, the episodes have the hashes of rows that are played by themselves."""
     name = "thesis-ch6-v0"

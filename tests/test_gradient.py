@@ -140,6 +140,7 @@ def test_a_linear_loop_is_led_to_its_optimum(budget):
     assert np.any(np.diff(np.sign(end.sent[end.chosen, 0, 0]))) or budget is not None  # a constant bias is not the optimum
 
 
+@pytest.mark.long
 def test_the_exported_program_plays_the_schedule(tmp_path):
     """With a trigger on the road, a budget, and steps without a value: the file gives the bits of the torch form."""
     loop = loop_of("gusty-stop-and-go-v0", "kf", 160, onset=20)

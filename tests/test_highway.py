@@ -159,6 +159,7 @@ def test_restarted_rows_are_fresh_and_the_others_untouched(same_tree):
     assert np.array_equal(again.plant.cars[[0, 2]], state.plant.cars[[0, 2]]) and not np.array_equal(again.plant.cars[1], state.plant.cars[1])
 
 
+@pytest.mark.long
 def test_a_collision_ahead_is_the_scenes():
     """A car told that the gap is 50 m more runs into somebody: the gap is then not above 0, and never before; afterwards all stands still."""
     trace = runs("highway-braking-v0", Adds(50.0), range(2), 300)
@@ -240,6 +241,7 @@ def test_what_does_not_fit_is_refused():
         plan.bench.road.np_random.uniform()
 
 
+@pytest.mark.long
 def test_the_suite_grants_what_its_attacks_need():
     """An attack of the suite spends its whole budget where the car ahead brakes; what is granted is what its scripts send, and no more."""
     suite = load_suite("highway-v0")

@@ -94,6 +94,7 @@ def test_informedness_of_pairs_that_are_known_by_hand() -> None:
     assert held == {"value": 0.2, "low": low[0] - high[1], "high": high[0] - low[1]}
 
 
+@pytest.mark.long
 def test_trust_reports_informedness_next_to_detection() -> None:
     """The old property stays as it is; the new one is the least of the attacked cells, at alpha over their number."""
     given = Suite("s", "", ("stop-and-go-v0",), (12,), ("chi2_kf", "always_alarm"), ("none", "fdi:trigger=near,threshold=60,value=-40", "dropout:trigger=near,threshold=60"), 20)

@@ -51,6 +51,7 @@ def law_on(name, law, x, f, heard, i, dt, scales):
     return -scales[1] * law.b * (v - lead) - scales[0] * law.k * sum(off) / len(off), keep * f
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("name", LAWS)
 def test_an_insider_drives_by_the_printed_law_with_other_gains(name):
     """Every command of every car is the law's on the car's own belief; from FIRST on the insider's has scaled gains, and its controller."""
@@ -109,6 +110,7 @@ def test_an_insider_heeds_no_defence_of_its_own():
     assert (brake.control[k, :, CAR] > calm.control[k, :, CAR]).all() and (calm.control[k, :, CAR] <= -2.0).all()
 
 
+@pytest.mark.long
 def test_one_gain_alone():
     """`targets` names the gains: that of the error by `distance`, that of its rate by `velocity`."""
     one = play(place_of(), ATTACK + ",targets=[velocity]")
@@ -197,6 +199,7 @@ def growth(kp, kd, headway, tau, dt):
     return float(np.abs(np.linalg.eigvals(whole[:3, :3] + np.outer(whole[:3, 3], law))).max())
 
 
+@pytest.mark.long
 @pytest.mark.thin(4)
 @pytest.mark.parametrize("scale", [-0.1, -0.15, -0.25, -0.3])
 def test_the_gain_at_which_a_car_swings_is_the_closed_form(scale):

@@ -45,6 +45,7 @@ def _whole(result: dict[str, Any], folder: Path) -> str:
     return json.dumps(result).replace(str(folder), "FOLDER")
 
 
+@pytest.mark.long
 def test_an_interrupted_search_goes_on(job: standard.Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Networks begin with scripts of the journal; the result is that of a search in one go, and no journal is left."""
     _counted(monkeypatch, some=FEW)

@@ -73,6 +73,7 @@ def test_kf_equals_filterpy_over_300_steps():
             np.testing.assert_allclose(state.filter.P[b, 0], reference.f.P, atol=1e-10)
 
 
+@pytest.mark.long
 def test_filterpy_plays_through_the_adapter(short, play):
     """per_episode(filterpy) drives the same closed loop as `kf`, row by row, under a dropout of one sensor."""
     attack = tailgate.make_attack("dropout", targets=("velocity",), length=20)
@@ -306,6 +307,7 @@ def test_a_stable_mode_that_nobody_sees_has_a_steady_state(linear_model):
     assert steady_state(linear_model(0.9, 0.0, 1.0, 1.0))[0, 0, 0] == pytest.approx(1.0 / 0.19, rel=1e-12)
 
 
+@pytest.mark.long
 def test_the_time_varying_filter_settles_at_the_steady_one():
     """From its golden-ratio gain on, the steady filter's estimates are the varying one's: 1.618 and 0.618 for A = C = Q = R = 1."""
     model = load_scenario("thesis-ch4-v0").brief().model

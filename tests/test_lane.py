@@ -72,6 +72,7 @@ def test_a_steady_bend_has_the_closed_form(sign):
     assert np.abs(last[[0, 1, 3]]).max() < 1e-5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("bias", [BIAS, -BIAS])
 def test_a_bias_on_the_offset_moves_the_car_the_other_way(bias):
     """It settles at -b: the estimate believes in the middle of the lane."""
@@ -152,6 +153,7 @@ def test_the_compiled_environment_has_the_bits_of_the_plain_one(tmp_path, knowle
     as_plain({"scenario": NAME, "defence": "chi2_kf", "knowledge": knowledge, "value": 0.5}, 70, tmp_path)
 
 
+@pytest.mark.long
 def test_the_observation_is_of_the_lane():
     from tailgate.envs.gym.gymnasium_env import AdversaryEnv
 
@@ -166,6 +168,7 @@ def test_the_observation_is_of_the_lane():
     assert "speed" not in values and model.lane == 1.75
 
 
+@pytest.mark.long
 def test_a_reward_counts_half_of_the_lane_as_its_whole_range():
     """Driving a car off the lane earns the fall of the whole gap, and 1 for leaving it."""
     from tailgate.envs.gym.gymnasium_env import AdversaryEnv
@@ -246,6 +249,7 @@ def test_stanleys_law_keeps_the_lane():
     assert not found["crashed"].any() and found["min_gap"].min() > 1.2
 
 
+@pytest.mark.long
 def test_a_bias_on_the_offset_moves_a_car_under_stanleys_law_too():
     place = dataclasses.replace(quiet(fdi_bound=1.0, budget=None, end=600, targets=("lane_offset",)), controller=LaneStanley())
     trace = play(place, attack=f"fdi:start_step=60,value={BIAS}")

@@ -165,6 +165,7 @@ def _moved(filter_, plan, model, r, accept=None):
     return filter_.update(plan, belief, innovation, every if accept is None else accept).x
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", ["thesis-ch6-v0", "thesis-ch5-v0"])
 def test_the_bound_between_two_attacks_is_reached_and_never_passed(name):
     """Directed attacks part the estimates by lam max |Q^-1 C' s| to 1e-6; random ones by less, and none is farther from the prior than half."""
@@ -289,6 +290,7 @@ def test_platoon_rows_do_not_depend_on_their_batch(defence, attack):
     assert len({whole.trace_hash(seed) for seed in range(9)}) == 9
 
 
+@pytest.mark.long
 def test_the_thesis_platoon_withstands_what_the_linear_filter_does_not():
     """Own distance of the attacked car, medians of the maximum: below 1 m under hold and injection; the linear filter's above 3 m."""
     place, own = load_scenario("thesis-ch6-v0"), 2
@@ -328,6 +330,7 @@ def test_the_centralised_filter_is_the_kalman_filter_of_all_sensors():
     assert C.shape == (15, 19) and np.array_equal(C[6:9], model.C[2]) and np.array_equal(R[6:9, 6:9], model.R[2]) and not R[6:9, :6].any()
 
 
+@pytest.mark.long
 def test_the_centralised_reference_is_better_than_each_agent_alone():
     """One estimator with 15 sensors: under injection into car 2 its distance error is below the distributed one's, and lam counts."""
     place, own = load_scenario("thesis-ch6-v0"), 2

@@ -169,7 +169,7 @@ def predicted(run: Any, observation: Any, memory: Any, first: bool, mask: Any) -
 PLAYED = [*((name, SMALL[name][1]) for name in SMALL), ("ppo", "increment"), ("recurrent_ppo", "continuous")]
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(6)
 @pytest.mark.parametrize(("name", "action"), PLAYED, ids=lambda value: str(value))
 def test_what_is_exported_is_what_torch_predicts(name: str, action: str, paid: dict[str, Any], tmp_path: Path) -> None:
     """Over whole episodes: outputs within 1e-5, and the same actions; the policy played as an attack gives the very trace."""
@@ -246,6 +246,7 @@ def test_settings_that_do_not_fit_are_refused(name: str, field: str, value: Any,
         learner(name, paid, **{field: value})
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "action", "rate"),
     [

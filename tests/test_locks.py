@@ -52,6 +52,7 @@ def somebody(place: Path) -> Iterator[None]:
         thread.join()
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_second_command_is_refused_before_anything_moves(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -127,6 +127,7 @@ def test_an_attack_is_of_every_family_whose_shape_it_has(attack: str, also: set[
     assert families(attack) == {Spec("attack", attack).entry.name} | also
 
 
+@pytest.mark.long
 def test_what_is_held_out_is_held_out_under_other_names(tmp_path: Path) -> None:
     """A program with a ramp is refused by name, and left out of the suite's attacks, which the card says."""
     attacks = ("none", "dropout", "program:path=slow_ramp_then_hold")

@@ -28,6 +28,7 @@ SEATS = {
 MODEL = load_scenario("stop-and-go-v0").brief().model
 
 
+@pytest.mark.long
 @settings(max_examples=60)
 @given(
     onset=st.integers(1, 6), more=st.none() | st.integers(0, 20), budget=st.none() | st.integers(0, 9), duration=st.none() | st.integers(1, 4),
@@ -80,6 +81,7 @@ def test_an_action_is_illegal_exactly_where_its_mask_is_closed(seat, interval, l
     assert opened >= 12 and (closed > 15 or (interval == 20 and limits["budget"] is None))
 
 
+@pytest.mark.long
 def test_a_collision_within_a_decision_makes_it_not_illegal():
     """A pause that would have been over in it leaves the action open, though the episode ends before."""
     seen = 0

@@ -278,6 +278,7 @@ def test_a_board_is_checked_from_its_cells_alone(small: tuple[Suite, Path], monk
     assert [(stray["defence"], stray["field"]) for stray in off] == [("kf", "under_attack")]
 
 
+@pytest.mark.long
 def test_a_page_has_the_columns_of_a_board_that_has_the_figures(small: tuple[Suite, Path], tmp_path: Path) -> None:
     made = json.loads((small[1] / "board.json").read_text())
     text = build_site([made], tmp_path, replays=False).read_text(encoding="utf-8")

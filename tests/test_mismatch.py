@@ -43,6 +43,7 @@ def test_no_truth_of_its_own_changes_nothing() -> None:
     assert loop.told is None and loop.load == 1.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [n for n in list_scenarios() if load_scenario(n).truth])
 @pytest.mark.thin(5)
 def test_everyone_is_told_the_nominal_model(name: str) -> None:

@@ -165,6 +165,7 @@ def biased(play):
     return run
 
 
+@pytest.mark.long
 def test_reacquire_ends_the_lock_out(biased):
     """After a bias of 3 m for 15 steps, and 15 steps of jamming: with gate_out one run in ten or more never recovers, with reacquire all do."""
     _, gate_out = biased("chi2_kf:eta=20", 15)

@@ -183,6 +183,7 @@ def _updated(filter_, plan, model, r, accept=None, P=None):
     return filter_.update(plan, _belief(filter_, plan, len(r), model, P), Innovation(r, S), accept).x
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("gain", ["steady", "varying"])
 def test_sensors_that_are_not_accepted_leave_the_problem(gain, same_bits):
@@ -312,6 +313,7 @@ def test_network_rows_do_not_depend_on_their_batch(defence, attack):
     assert len({whole.trace_hash(seed) for seed in range(9)}) == 9
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:Solution may be inaccurate")
 def test_cvxpy_gives_the_same_estimates_in_the_loop():
     """Both solvers play the same episode, under an attack and a dropout of some sensors, to the solver's tolerance."""
@@ -333,6 +335,7 @@ def test_a_missing_cvxpy_names_its_extra(monkeypatch):
     tailgate.make_defence("norm_resilient")
 
 
+@pytest.mark.long
 def test_it_composes_with_gates_and_with_a_filter_that_forgets():
     """A gate that never shuts changes no bit; one that does keeps the errors finite; after forgetting, the next reading is fitted exactly."""
     place = dataclasses.replace(load_scenario("thesis-ch5-v0"), horizon=30)

@@ -58,6 +58,7 @@ def test_they_are_ceilings():
 # -- losses
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("objective", ["final", "sum"])
 @pytest.mark.parametrize(
     "rules",
@@ -132,6 +133,7 @@ def test_played_losses_are_those_predicted(play):
         assert other.mean() < squared.mean() / 3.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("threat", [{"duration": 3}, {"duration": 2, "cooldown": 4}, {"end": 50, "cooldown": 3}, {"budget": None, "end": 20}])
 @pytest.mark.thin(4)
 def test_the_channel_accepts_every_loss(threat, play):
@@ -371,7 +373,7 @@ def test_the_scalar_loop(play):
 @pytest.mark.parametrize("scenario, defence, attack", [
     ("linear-dos-v0", "kf", "optimal_dos"), ("linear-stealth-v0", "chi2_kf", "optimal_stealth"), ("scalar-hold-v0", "none", "optimal_hold"),
 ])
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 def test_rows_do_not_depend_on_their_batch(scenario, defence, attack, play):
     """Alone, among 3 or among 32: the same trace to the last bit."""
     place = load_scenario(scenario)

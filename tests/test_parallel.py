@@ -68,6 +68,7 @@ def test_knobs_that_nobody_turns_change_no_bit(place, plain, steered, short):
     assert [own.trace_hash(i) for i in range(4)] != [other.trace_hash(i) for i in range(4)]
 
 
+@pytest.mark.long
 def test_a_setting_is_the_defence_with_these_parameters(short):
     """Threshold 8 and braking, held throughout, is brake_kf with eta 8 to the last bit; the menu's last knob runs fastest."""
     knobs = Steered().hand.knobs
@@ -80,6 +81,7 @@ def test_a_setting_is_the_defence_with_these_parameters(short):
     assert [one.trace_hash(i) for i in range(4)] == [two.trace_hash(i) for i in range(4)] and (one.mode == Mode.BRAKE).any()
 
 
+@pytest.mark.long
 def test_the_challenge_knob_sets_how_often_the_probe_is_muted(short):
     """Over 8000 steps without an attack the muted share is the knob's probability within its 99.9 % interval."""
     place = short("radar-following-v0", horizon=80)

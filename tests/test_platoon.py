@@ -74,6 +74,7 @@ def derivative(name, law, graph, tau, X, ur):
     return dX
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("dt", [0.1, 1.0])
 @pytest.mark.parametrize("topology", TOPOLOGIES)
 @pytest.mark.parametrize("name", LAWS)
@@ -122,7 +123,7 @@ def test_the_desired_gap_is_a_fixed_point(name, topology, speed):
     assert after[0] == pytest.approx(speed * model.dt)
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 @pytest.mark.parametrize(
     "name, topology", [("cacc", "predecessor_leader"), ("ploeg_cacc", "predecessor"), ("consensus_cacc", "bidirectional"), ("consensus_cacc", "two_predecessor")]
 )
@@ -288,6 +289,7 @@ def test_sensors_need_a_told_noise():
         PlatoonSensors().matrices(make("plant", "sensor_network"))
 
 
+@pytest.mark.long
 @pytest.mark.thin(30)
 @pytest.mark.parametrize("name", PLATOONS)
 def test_every_scenario_has_a_manoeuvre_and_is_driven_without_a_collision(name):

@@ -28,6 +28,7 @@ def shown(png):
     return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
 
 
+@pytest.mark.long
 def test_one_picture_a_place_and_one_scatter(tmp_path):
     """A file per scenario and dose; a name that is no file name is made one; skipped cells stay empty."""
     table = [*TABLE, entry("a", "x", 1.0, 9.0, 0.0, "../odd name", None)]

@@ -73,7 +73,7 @@ def test_a_policy_of_several_frames_plays_as_it_was_trained(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("scenario", MANY)
 @pytest.mark.parametrize(("action", "knowledge"), [({"action": "mode", "per_agent": True}, "black"), ({"action": "increment"}, "white")])
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 def test_a_policy_of_many_agents_plays_as_it_was_trained(tmp_path: Path, scenario: str, action: dict[str, Any], knowledge: str) -> None:
     _same_trace(tmp_path, action | {"interval": 3}, knowledge, scenario, MANY[scenario])
 
@@ -108,6 +108,7 @@ def _same_trace(tmp_path: Path, spec: dict[str, Any], knowledge: str, scenario: 
     assert [stepped.trace_hash(i) for i in range(len(SEEDS))] == [played.trace_hash(i) for i in range(len(SEEDS))]
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("action", ["mode", "increment"])
 def test_a_stochastic_policy_repeats_whatever_the_batch(tmp_path: Path, action: str) -> None:

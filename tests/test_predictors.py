@@ -179,6 +179,7 @@ def test_a_reset_is_least_squares_on_the_last_samples(model):
     np.testing.assert_allclose(last[1], LEAD[2] + 0.5, atol=0.1)
 
 
+@pytest.mark.long
 def test_a_steady_leader_is_rarely_taken_for_one_that_changed(model):
     """Four CUSUMs with drift 1/2 and threshold 10 run for 141 000 samples each on average (Siegmund): of 60 000 steps, at most 7 resets."""
     y, v, *_ = drive(200, 300, seed=9)

@@ -55,7 +55,7 @@ MINIMAL = {"steps": "at: [3, [7, 30]]", "chance": "probability: 0.3", "bursts": 
            "speed": "threshold: 20", "slow": "threshold: 30", "leader_braking": "threshold: 0", "time": "start: 9", "reading": "threshold: 20, latest: 30"}  # fmt: skip
 
 
-@pytest.mark.thin(9)
+@pytest.mark.thin(18)
 @pytest.mark.parametrize("kind", ALL)
 @pytest.mark.parametrize("trigger", TRIGGERS)
 def test_every_trigger_plays_with_every_kind(trigger, kind, short, loop_of, write):
@@ -236,7 +236,7 @@ def test_a_file_is_evaluated_like_any_attack(write, tmp_path):
     assert row["attack_steps"] == 7 and row["status"] == "ok" and len(row["attack_digest"]) == 64
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(6)
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_built_in_programs_play(name, short, play):
     """Every phase of a built-in program comes in some of the episodes, nothing is refused, and it says what it does."""

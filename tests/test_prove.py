@@ -181,6 +181,7 @@ def test_the_quantile_of_uniform_noise_covers_sums_of_it():
     assert quantile_of(0.025, False) == pytest.approx(1.95996, abs=1e-5)
 
 
+@pytest.mark.long
 def test_the_variance_is_that_of_the_loop():
     place = dataclasses.replace(lane(budget=0), manoeuvre=make("manoeuvre", "bend", value=0.0))
     trace, tube = play(place, runs=4000), Tube(affine_loop(lane(budget=0)), alpha=0.01)
@@ -233,6 +234,7 @@ def test_bisection_finds_the_border_of_a_linear_bound():
     assert tube.under(border * 0.999).gap > 0.0 > tube.under(border * 1.001).gap
 
 
+@pytest.mark.long
 def test_a_smaller_budget_proves_no_less():
     found = [Tube(affine_loop(dataclasses.replace(lane(budget=n), horizon=80), at_rest=True), alpha=1e-3).largest(10.0, limits=False) for n in (0, 1, 5, 40, None)]
     assert found[0] == 10.0 and all(a >= b for a, b in itertools.pairwise(found)) and found[3] > found[4] * 0.99

@@ -156,6 +156,7 @@ def test_a_program_over_the_air_needs_a_radar(tmp_path):
 # -- the published scenarios
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["radar-following-v0", "radar-braking-v0", "radar-fast-attacker-v0"])
 @pytest.mark.parametrize("defence", ["none", "kf", "chi2_kf", "cra"])
 @pytest.mark.thin(5)
@@ -167,6 +168,7 @@ def test_without_an_attack_everybody_arrives(name, defence):
     assert not trace.alarm.any() and (trace.length == trace.horizon).all()
 
 
+@pytest.mark.long
 def test_the_fast_attacker_is_the_limit_of_the_challenge():
     """The same late echo: heard by cra from beyond 30 m in many episodes, and in none where the attacker falls silent in 10 ns."""
     heard, crashed = {}, {}

@@ -138,6 +138,7 @@ def test_the_noise_of_a_loop_is_its_own():
     assert (noise == 1.0).all() and len(set(alone.tolist())) == 1  # no chance is left
 
 
+@pytest.mark.long
 def test_an_estimate_agrees_with_plain_episodes():
     """The loop under splitting: the share of 20 000 plain episodes lies within the interval."""
     case = dataclasses.replace(NOISE, formula="G[10,60] error < 3")

@@ -15,6 +15,7 @@ from tailgate.envs.sensors.redundant import DEVICES, Redundant
 from tailgate.play.trace import rollout
 
 
+@pytest.mark.long
 def test_each_device_has_its_own_noise():
     """Readings less the truth have the standard deviations of the devices, and are independent."""
     trace = rollout(load_scenario("redundant-two-v0").loop(tailgate.make_defence("kf")), tailgate.make_attack("none"), keys("train", range(64)))

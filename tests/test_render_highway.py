@@ -232,6 +232,7 @@ def test_collisions_are_marked(monkeypatch):
     assert signs == ["COLLISION", "REAR COLLISION", "COLLISION: car 3"]
 
 
+@pytest.mark.long
 def test_a_collision_among_traffic_is_marked(said):
     """HighwayEnv's own crash ends the episode with a sign."""
     env = made(HIGHWAY, steps=0, scenario="highway-braking-v0", defence="none", value=50.0, threat={"onset": 1, "end": None}, autoreset="disabled")

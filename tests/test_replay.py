@@ -163,6 +163,7 @@ def test_a_row_imports_nothing_unless_the_user_names_the_class(pick, tmp_path, m
     sys.modules.pop(f"evil_{family}")
 
 
+@pytest.mark.long
 def test_a_policy_is_found_again_by_its_content(tmp_path, monkeypatch):
     """The file of a row's policy may have moved: the same content is taken, another file is not."""
     monkeypatch.chdir(tmp_path)

@@ -143,6 +143,7 @@ def test_the_worst_row_of_a_network_has_the_largest_error(rows):
     assert choose([few, many, few], Filter()).line == 2
 
 
+@pytest.mark.long
 def test_the_command_takes_an_agent(folder, rows, tmp_path, capsys):
     """--agent chooses; one that does not exist is bad input, and nothing is written."""
     path = tmp_path / "rows.jsonl"

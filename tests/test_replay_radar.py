@@ -159,6 +159,7 @@ ROAD = {
 }  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.page
 @pytest.mark.parametrize("name", ["radar", "highway"])

@@ -83,6 +83,7 @@ def test_the_readings_differ_as_they_say():
     assert np.abs(np.linalg.eigvals(models["printed"].A)).max() <= 1.0
 
 
+@pytest.mark.long
 def test_a_standstill_changes_the_noise_and_no_verdict():
     """With 18.5 times the noise most cars halt once, and then other noise moves them than Q; where they may roll back it is Q."""
     from tailgate.thesis.ch4_cases import THESIS, Played, rolling
@@ -109,6 +110,7 @@ def test_the_literal_plant_switches_on_the_sign_of_the_acceleration():
     np.testing.assert_allclose(after[:, 0, 1], 20.0 + 0.01 * ego[:, 0, 2] - 0.01 * 10.0 / (1.008 * 3.0))
 
 
+@pytest.mark.long
 def test_the_same_seeds_give_the_same_figures():
     """Two runs of the cases agree in every digit."""
     from tailgate.thesis.ch4_cases import Played
@@ -133,6 +135,7 @@ def test_a_verdict_has_three_values(yes, no, word):
     assert verdict(yes, no) == word
 
 
+@pytest.mark.long
 def test_verdicts_follow_what_is_measured(monkeypatch):
     """On a plant, attack or gate for which a claim is true, the same code says so; on another that it is false."""
     from tailgate.estimators import GatedKalman

@@ -67,6 +67,7 @@ def test_chapter_5_clean_convergence(systems):
     assert low >= 5 and high <= 9
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize(
     ("case", "guard", "figure", "digits"), [("dos", "lasso", 0.72, 2), ("dos", "dkf", 9.9, 1), ("fdi", "lasso", 0.56, 2), ("fdi", "dkf", 4.8, 1)]
 )

@@ -89,6 +89,7 @@ def test_the_number_of_runs_is_no_verdict():
     assert ch7_trust.judge([none], 0.95) == ("no", "") and "0.5 inside" in ch7_trust.judge([half], 0.95)[1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("chapter", "expected"), [("ch5", {"5.3.2": "yes", "5.3.5": "no"}), ("ch6", {"6.5.1": "yes", "6.5.2": "yes", "6.5.5": "no"})])
 @pytest.mark.thin(2)
 def test_theorems_without_a_figure(chapter, expected, monkeypatch):

@@ -37,7 +37,7 @@ def _episode(interval=1, shaped=True, **options):
 
 @pytest.mark.parametrize("interval", [1, 5])
 @pytest.mark.parametrize("reward", ["collision", "min_gap", "error", "stealth"])
-@pytest.mark.thin(6)
+@pytest.mark.thin(4)
 def test_shaping_telescopes(reward, interval):
     """The discounted sum of what shaping adds is gamma^T Phi(end) - Phi(start), Phi(end) = 0 at a collision: no policy gains."""
     total, discount = np.zeros(8), 1.0
@@ -111,6 +111,7 @@ def test_the_smallest_gap_of_any_car_counts():
     np.testing.assert_allclose(reward.potential(gap, belief), [0.88 + 0.7, 0.7])
 
 
+@pytest.mark.long
 def test_belief_is_positive_where_a_car_thinks_it_has_more_room():
     """Added distance makes a follower believe in a larger gap: the shaping potential rises."""
     env = AdversaryVectorEnv(2, scenario="platoon-braking-v0", defence="dkf", value=20.0, gap_shaping=0.0, gamma=1.0, reward="collision",

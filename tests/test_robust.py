@@ -89,6 +89,7 @@ def test_no_price_is_above_the_solvers(family, q):
     assert (theirs <= ours * (1.0 + 1e-5) + 1e-9).all()
 
 
+@pytest.mark.long
 def test_cvxpy_gives_the_same_estimates_in_the_loop(short, play):
     """Both solvers drive the same episodes, under an attack and a dropout of one sensor, to the solver's tolerance."""
     pytest.importorskip("cvxpy")

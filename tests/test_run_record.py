@@ -45,6 +45,7 @@ def _held(folder: Path) -> dict[str, Any]:
     return held
 
 
+@pytest.mark.long
 def test_a_run_says_what_it_took(suite: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Clock, processor, rows; who plays nothing, or scores alone, changes neither record nor board."""
     began, used = time.perf_counter(), processor_time()

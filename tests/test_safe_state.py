@@ -300,6 +300,7 @@ def struck(trace):
 HIDDEN = "fdi:trigger=near,threshold=20,value=-20"
 
 
+@pytest.mark.long
 def test_chapter_7_a_hidden_gap_collides_undefended_and_not_behind_the_brake():
     """The case study would have no attack to defend against, or no defence."""
     place = load_scenario("ch7-v0")
@@ -335,6 +336,7 @@ def test_the_brake_keeps_clear_of_a_leader_that_brakes_as_hard_as_it_reckons_wit
     assert not struck(trace).any() and metrics.min_gap(trace).min() > 0.4
 
 
+@pytest.mark.long
 def test_a_false_reading_far_from_danger_does_not_make_it_collide_later():
     """The brake would slow the car, look away, and let the controller that closes the gap run into a leader that stops 15 s later."""
     place = dataclasses.replace(load_scenario("gusty-stop-and-go-v0"), horizon=420).with_threat(budget=20)
@@ -355,6 +357,7 @@ def test_it_costs_nothing_without_an_attack(name):
     assert (metrics.distance_travelled(guarded) / metrics.distance_travelled(bare)).min() >= 0.98
 
 
+@pytest.mark.long
 def test_a_linear_filter_does_not_reverse_a_car_that_the_brake_holds():
     """It would take the brake's command for a speed below zero, believe in a longer gap, and let the car roll into the one that stands."""
     place = load_scenario("braking-v0").with_threat(kinds=("fdi",), fdi_bound=3.0, budget=20)

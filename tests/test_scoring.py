@@ -380,6 +380,7 @@ def test_an_attack_more_never_makes_a_figure_better(seed) -> None:
                 assert y["value"] <= x["value"] and y["low"] <= x["low"]
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("attacks", [1, 12])
 def test_the_interval_covers_the_critical_dose_of_a_known_curve(attacks) -> None:

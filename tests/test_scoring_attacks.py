@@ -112,6 +112,7 @@ def part():
     )  # fmt: skip
 
 
+@pytest.mark.long
 def test_an_attack_is_admitted_by_what_it_does_on_select_seeds_and_else_not(part, tmp_path) -> None:
     """A ramp at the right moment beats a small bias at a wrong one, and a small bias that widens the gap does not beat the ramp."""
     path, rows = tmp_path / "attacks.jsonl", tmp_path / "rows.jsonl"

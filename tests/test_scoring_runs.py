@@ -219,6 +219,7 @@ def test_a_mean_time_that_is_out_of_reach_is_listed_and_not_an_error() -> None:
     assert not found["entries"] and "hours" in found["without"][0]["reason"]
 
 
+@pytest.mark.long
 def test_the_looser_threshold_lets_a_stealthy_attacker_further() -> None:
     """The curve of deviation against false-alarm time rises; who has no score has none."""
     curve = stealth_impact(ROAD, "chi2_kf", few(0.02, 0.1), dose=100)

@@ -56,6 +56,7 @@ def test_bursts_and_pauses(sends):
     assert steps(sends("fdi", start_step=55, burst=3, pause=0)) == list(range(55, K + 1))
 
 
+@pytest.mark.long
 def test_signs_are_the_wires_own(sends):
     """With `signs` each wire has its own sign, the same in every step and episode; two seeds differ, without it all are alike."""
     seen = {}

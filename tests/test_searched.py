@@ -85,6 +85,7 @@ def made(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[
     return Path("small-v1.yaml"), Path("out/small-v1")
 
 
+@pytest.mark.long
 def test_one_command_searches_before_it_ranks(made: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     """Who passes the gates is attacked at the plan's dose; what was found is played at all doses, and once more nothing is."""
     file, folder = made
@@ -118,6 +119,7 @@ def test_one_command_searches_before_it_ranks(made: tuple[Path, Path], monkeypat
     assert {path: path.read_bytes() for path in Path("out").glob("**/*") if path.is_file()} == before
 
 
+@pytest.mark.long
 def test_a_rank_asks_for_the_searches(made: tuple[Path, Path]) -> None:
     """Each lack has its reason; a board holds what its statuses need, and entries that stay keep their searches."""
     file, folder = made
@@ -226,6 +228,7 @@ def test_what_each_member_adds() -> None:
     assert (white["cells"], white["alone"]) == (2, 1) and white["adds"] == pytest.approx(0.2) and white["damage"] == pytest.approx(0.75)
 
 
+@pytest.mark.long
 def test_a_packed_board_is_read_and_kept_packed(made: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
     """The head of both files is the same; scoring goes on with the packed one; a damaged one is refused in one line."""
     file, folder = made

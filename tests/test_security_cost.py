@@ -97,7 +97,7 @@ def test_a_unit_of_its_own_is_not_in_the_way(tmp_path):
     assert held.responses == {"one": 1, "two": 2, "three": 3} and set(held.load) == {"one", "two", "three"}
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 @pytest.mark.parametrize(("metric", "delay"), [("min_gap", 0.0), ("min_gap", 0.4), ("min_gap", 0.8), ("rmse_position", 0.0)])
 def test_a_longer_period_never_lowers_the_cost_of_car_following_at_the_same_delay(tmp_path, delay, metric):
     """Not so of errors of late readings, nor of a platoon: docs/security-cost.md."""
@@ -165,6 +165,7 @@ def same(one, two):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "attack",
     ["fdi:value=10,targets=[predecessor_acceleration]", "fdi:value=-10", "fdi_ramp:rate=0.5,limit=10,targets=[]", "dos_jam:low=5,high=5",
@@ -185,6 +186,7 @@ def test_a_tag_does_not_keep_a_message_from_being_lost(attack):
     assert same(sealed, played_in(attack)) and (sealed.kind != 0).any() and not sealed.refused.any()
 
 
+@pytest.mark.long
 def test_an_old_value_is_accepted_until_its_key_is_known():
     for age, kept in ((3, True), (4, False)):
         trace = played_in(f"delay:age={age}", authenticated=FIELDS, key_interval=3)

@@ -101,6 +101,7 @@ def test_what_is_exported_plays_as_in_training(brief, tmp_path):
     assert json.loads(path.read_text())["training"] == {"learner": "cem"}
 
 
+@pytest.mark.long
 def test_two_runs_of_a_seed_and_a_resumed_one_agree(brief, tmp_path):
     """Same seed, same file; interrupted and resumed, the same as well; another seed, another file; another pool, no resuming."""
     whole = run(brief, 3 * ROUND).export(tmp_path / "whole", {}).with_suffix(".safetensors").read_bytes()

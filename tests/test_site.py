@@ -247,6 +247,7 @@ def test_round_and_weaker_are_said(site, index):
     assert any(row.startswith("radar-ppo-3 black box learned chi2_kf eta=15") for row in index.rows("cells"))
 
 
+@pytest.mark.long
 def test_a_comparison_by_numbers_is_marked(tmp_path):
     """Where the numbers leave no choice nothing is marked, but what is corrected for the other pairs of the class."""
     board = make_board()
@@ -373,6 +374,7 @@ def test_links_lead_somewhere(site):
     assert count > 50
 
 
+@pytest.mark.long
 def test_where_nobody_did_damage_no_attack_is_called_the_worst() -> None:
     """`safe_state_brake` on radar-v0: no attack did anything at any dose, where `chi2_kf_sparse` has a worst one."""
     held = json.loads((ROOT / "results/radar-v0/board.json").read_text(encoding="utf-8"))

@@ -68,6 +68,7 @@ def test_too_many_subsets_are_refused(linear_model):
     assert len(without(14, 2)) == 91 and (without(5, 2).sum(axis=1) == 3).all()
 
 
+@pytest.mark.long
 @pytest.mark.thin(3)
 @pytest.mark.parametrize("text", ["kf_bank:s=0", "kf_bank:s=0,sliding=true", "observer_bank:s=0"])
 def test_without_attacked_sensors_a_bank_is_the_steady_filter(text):

@@ -187,6 +187,7 @@ def test_silent_sensors_are_no_zeros(linear_model, text):
     assert all(estimate.x[0, 0, 0] == pytest.approx(1000.0, abs=0.1) for _, estimate in out[7:])
 
 
+@pytest.mark.long
 def test_etpg_alarms_as_seldom_as_it_says_without_process_noise(linear_model):
     """The threshold is that of chi-square with q T - n degrees of freedom; process noise adds to the sum, and is in no threshold."""
     defence = tailgate.make_defence("etpg", window=5, alpha=0.1)
@@ -225,6 +226,7 @@ def test_a_watermark_is_a_part_of_the_command_and_known_to_the_filter():
     assert loud.score[loud.live].mean() == pytest.approx(known.score[known.live].mean(), rel=0.02)
 
 
+@pytest.mark.long
 def test_the_price_of_a_watermark_is_that_of_a_simulation():
     """The mean of x'Wx + u'Vu under the optimal feedback on a Kalman filter's estimate, with a watermark less without, in 8000 loops."""
     A, B = np.array([[1.0, 0.1], [0.0, 0.95]]), np.array([[0.0], [0.4]])

@@ -4,6 +4,7 @@ import statistics
 import time
 
 import numpy as np
+import pytest
 
 from tailgate.core import Kind, draws
 from tailgate.core.registry import Spec
@@ -33,6 +34,7 @@ def test_a_batch_is_worth_hundreds_of_single_episodes() -> None:
     assert statistics.median(ratios) > 300.0
 
 
+@pytest.mark.long
 def test_the_time_of_a_step_grows_with_the_batch_and_not_faster() -> None:
     _rate(8, 5)
     assert statistics.median(_rate(16384, 4) / _rate(4096, 8) for _ in range(3)) > 0.5

@@ -222,6 +222,7 @@ def test_the_curve_is_the_monotone_regression() -> None:
     assert fitted(np.array([1.0, 3.0, 2.0])) == pytest.approx([1.0, 2.5, 2.5])
 
 
+@pytest.mark.long
 def test_the_bootstrap_interval_covers_the_critical_dose() -> None:
     """Of 200 experiments with a known critical dose of 12.5 about 95 % cover it; 88 % is below the 99.9 % interval of that."""
     doses, shares = np.array([0.0, 10.0, 20.0]), np.array([0.0, 0.05, 0.25])
@@ -239,6 +240,7 @@ def test_the_bootstrap_interval_covers_the_critical_dose() -> None:
     assert hits >= 176
 
 
+@pytest.mark.long
 def test_dose_response_of_a_scripted_attack(tmp_path: Path) -> None:
     """Dose 0 is no attack, more steps do more, spent steps are the dose; the second call plays nothing again and says the same."""
     attack = "fdi:trigger=near,threshold=40,value=-3"
@@ -255,6 +257,7 @@ def test_dose_response_of_a_scripted_attack(tmp_path: Path) -> None:
     assert dose_figure(report)[:4] == b"\x89PNG"
 
 
+@pytest.mark.long
 def test_a_dose_response_of_an_error_counts_episodes_above_a_bound(tmp_path: Path) -> None:
     """Without a road: the mean has no critical dose until a limit is named, the share above a bound has one of 10 %."""
     arguments: dict[str, Any] = {"episodes": 6, "threat": {"kinds": ["fdi"], "fdi_bound": 100.0}, "rows_file": tmp_path / "rows.jsonl"}
@@ -330,6 +333,7 @@ def test_the_commands_write_reports_and_pictures(
     assert "--doses" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_timing_picture_has_a_panel_per_outcome(tmp_path: Path, brief_place: str) -> None:
     policy = str(_always(tmp_path, "p"))
     arguments: dict[str, Any] = {"scenario": brief_place, "episodes": 2}

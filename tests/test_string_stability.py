@@ -94,6 +94,7 @@ def test_the_sine_keeps_the_mean_speed_and_its_amplitude():
     np.testing.assert_allclose(np.array(values), np.stack([want, want], axis=1), atol=1e-10)
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("name", ["cacc", "ploeg_cacc"])
 def test_the_linear_loop_measures_what_the_model_says(name):

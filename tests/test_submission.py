@@ -226,6 +226,7 @@ def test_the_command_writes_rows_and_prints_a_summary(
     assert Spec("defence", "other_sub:Own").digest != named and Spec("defence", "own_sub:Own").digest != digest
 
 
+@pytest.mark.long
 def test_the_engine_leaves_seats_at_a_table_to_the_plain_loop() -> None:
     """Their steps wait for other rollouts, which would wait for the end of the tracing."""
     place = load_scenario("gusty-stop-and-go-v0")

@@ -362,6 +362,7 @@ def test_a_search_for_public_seeds_gains_nothing_on_seeds_from_a_beacon(world: P
     assert all(a >= b > 0.05 for a, b in zip(errors("hostile:Seeker", secret), filtered, strict=True))
 
 
+@pytest.mark.long
 def test_a_median_over_the_batch_is_found_out(world: Path) -> None:
     """Rows that depend on their companions become errors, all of them."""
     rows = _play(world, "hostile:Median", "good", ("none", FDI))

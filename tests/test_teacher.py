@@ -59,6 +59,7 @@ def test_the_nearest_action_has_the_commands_kind_targets_and_value() -> None:
     assert (nearest(seat.action, other)[command.kind == Kind.FDI] == 0).all()
 
 
+@pytest.mark.long
 def test_a_demonstration_is_the_script_and_its_returns() -> None:
     """Rest until the trigger, then ten steps of bias in two decisions, then jamming; a collision at the end is worth gamma to the steps before it."""
     seat = Seat.make(**ENVIRONMENT)

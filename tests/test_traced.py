@@ -50,7 +50,7 @@ ENVIRONMENTS = [  # beyond those of test_traced_cars.py and test_traced_many.py
 ]  # fmt: skip
 
 
-@pytest.mark.thin(4)
+@pytest.mark.thin(8)
 @pytest.mark.parametrize("arguments", ENVIRONMENTS, ids=lambda a: f"{a['scenario']}-{a['defence']}")
 def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
     as_plain(arguments, 5, tmp_path)
@@ -72,7 +72,7 @@ def test_a_strangers_defence_is_traced_as_it_stands(tmp_path, monkeypatch):
     as_plain({"scenario": "stop-and-go-v0", "defence": made}, 5, tmp_path)
 
 
-@pytest.mark.thin(5)
+@pytest.mark.thin(7)
 @pytest.mark.parametrize("terminate", [True, False])
 @pytest.mark.parametrize(("scenario", "defence", "rival"), [
     ("stop-and-go-v0", "mine", "fdi:value=5"), ("car-following-lossy-v0", "chi2_kf", "dos_hold"), ("gusty-stop-and-go-v0", "chi2_kf_sparse", "none"),
@@ -127,6 +127,7 @@ class Turning:
         return dataclasses.replace(self.made, gain=self.gain).step(plan, state, received, known_u, draws)
 
 
+@pytest.mark.long
 def test_an_object_that_is_changed_is_traced_again(tmp_path, monkeypatch):
     turning, hashes = Turning(plugin(tmp_path, monkeypatch).Saturated()), []
     attack, (loop, keys) = NoAttack(), (load_scenario("stop-and-go-v0").loop(turning), draws.keys("report", range(40)))
@@ -218,6 +219,7 @@ def test_a_state_of_another_form_has_another_program(names, monkeypatch):
             assert [got.trace_hash(i) for i in range(3)] == [wanted.trace_hash(i) for i in range(3)]
 
 
+@pytest.mark.long
 def test_intervals_share_code_and_not_their_length():
     """Decisions of 12 and 5 steps have one program, and each plays its own number of them."""
     for interval in (12, 5, 1, 5):

@@ -123,6 +123,7 @@ def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack, t
     trace_as_plain(*loop_of(scenario, defence, attack, **threat))
 
 
+@pytest.mark.long
 def test_a_run_to_the_horizon_goes_on_after_a_collision():
     """Without an end at a collision the attack goes on as well, to the last bit."""
     loop, rival = loop_of("gusty-stop-and-go-v0", "chi2_kf", "fdi:trigger=near,threshold=30,value=-4", horizon=600)
@@ -161,7 +162,7 @@ ENVIRONMENTS = [
 ]  # fmt: skip
 
 
-@pytest.mark.thin(9)
+@pytest.mark.thin(18)
 @pytest.mark.parametrize("arguments", ENVIRONMENTS, ids=lambda a: f"{a['scenario']}-{a['defence']}")
 def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
     """Observations, rewards, flags and information, over restarts, a masked reset and what was held."""
@@ -226,6 +227,7 @@ def test_what_is_not_finite_is_refused_as_in_the_plain_loop():
     assert said[0] == said[1]
 
 
+@pytest.mark.long
 def test_a_calm_road_does_not_slow_down():
     """Without noise, and after the filter has settled, no number is so small that the processor takes its slow path."""
     place = load_scenario("thesis-ch4-v0")

@@ -111,7 +111,7 @@ NETWORKS = [
 ]
 
 
-@pytest.mark.thin(43)
+@pytest.mark.thin(86)
 @pytest.mark.parametrize(("scenario", "defence", "attack", "threat"), PLATOONS + NETWORKS)
 def test_a_trace_is_the_plain_loops_to_the_last_bit(scenario, defence, attack, threat):
     many = {"onset": 10, "end": 80} if scenario in (RESTLESS, WEAK, NOISY, LARGE, THESIS, "network-weak-v0") else {}
@@ -214,6 +214,7 @@ def test_an_environment_is_the_plain_one_to_the_last_bit(arguments, tmp_path):
     as_plain(arguments, 9, tmp_path)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scenario", ["platoon-gusty-v0", WEAK])
 def test_what_is_not_finite_is_refused_as_in_the_plain_loop(scenario):
     """A measurement of 1e308 makes the score infinite."""
@@ -270,6 +271,7 @@ def test_a_single_environment_is_a_batch_of_one(action, scenario, reward):
         assert all(np.array_equal(value, second[4][key]) for key, value in first[4].items())
 
 
+@pytest.mark.long
 def test_what_replays_read_is_searched_in_loops():
     """Thirty rings of fifty samples: one by one they would be ten times as many numbers, and take half a minute to compile."""
     program = commanded(loop_of("platoon-v2v-v0", "kf", "replay")[0]).program

@@ -298,6 +298,7 @@ def _refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     return capsys.readouterr().err
 
 
+@pytest.mark.thin(2)
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -161,6 +161,7 @@ def test_a_run_is_set_aside_when_its_turn_comes(tmp_path: Path) -> None:
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.json")} == before
 
 
+@pytest.mark.long
 def test_a_suites_trainings_go_to_the_workers_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All seeds of all learners that are not there yet are one list for as many workers as are asked for."""
     configs = [plan(tmp_path, name, "seeds=3", "steps=1200") for name in ("first", "second")]

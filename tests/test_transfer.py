@@ -24,6 +24,7 @@ THREAT, ZOO, _always, _recorded = strong.THREAT, strong.ZOO, strong.always, stro
 brief_place, half_place = strong.brief_place, strong.half_place
 
 
+@pytest.mark.long
 def test_many_defences_have_a_line_each(capsys: pytest.CaptureFixture[str], tmp_path: Path, brief_place: str) -> None:
     """A few of them are columns beside their intervals."""
     policy = str(_recorded(_always(tmp_path, "policy-0"), scenario=brief_place))

@@ -111,6 +111,7 @@ def test_leader_braking_needs_two_looks():
     assert on_steps(LeaderBraking(threshold=1.0), 2, Timing(1, 0.01), road=road) == [2]
 
 
+@pytest.mark.thin(3)
 @pytest.mark.parametrize("dt", [0.1, 0.01])
 @pytest.mark.parametrize("wanted", [{"frequency": 0.4}, {"share": 0.2}, {"share": 0.75}])
 def test_random_bursts_keep_their_frequency_share_and_length(wanted, dt):

@@ -142,6 +142,7 @@ def test_defences_are_compared_on_the_same_seeds(found: Found, short: str) -> No
     assert duel["p"] == pytest.approx(mcnemar(duel["only_a"], duel["only_b"]))
 
 
+@pytest.mark.long
 def test_rows_depend_on_nothing_but_their_seeds(found: Found, short: str) -> None:
     """Another batch would give other counts for the same seeds."""
     for job, row in list(zip(jobs_of(_suite(short), runs=N, batch=16), _rows(found[1]), strict=True))[1:3]:
@@ -176,6 +177,7 @@ def test_an_interrupted_run_goes_on_where_it_was(found: Found, short: str, tmp_p
     assert (tmp_path / "cells.jsonl.1").is_file()
 
 
+@pytest.mark.long
 def test_a_defence_that_was_not_attacked_has_no_bound(short: str) -> None:
     """It would be trusted for not being attackable, or for a crash."""
     found = check(_suite(short, defences=("none", "chi2_kf"), attacks=("none", JAM, "stealth:trigger=near,threshold=40")), runs=4)
@@ -224,6 +226,7 @@ def test_an_alarm_at_random_earns_no_bound_of_detection(short: str) -> None:
     assert not any(duel["of"] == "trust" and AT_RANDOM in (duel["a"], duel["b"]) for duel in found["comparisons"])
 
 
+@pytest.mark.long
 def test_another_limit_of_false_alarms_can_be_stated(short: str) -> None:
     """A user's own limit would be ignored, or a board would take it for the default."""
     found = check(_suite(short, defences=(AT_RANDOM,), attacks=("none", SEEN)), runs=6, asked=Demands(false_alarms=1e-5))
@@ -260,6 +263,7 @@ def test_an_alarm_that_stays_on_counts_again() -> None:
     assert false_alarms(SimpleNamespace(alarm=alarm, live=live, batch=3), 10).tolist() == [3, 3, 2]
 
 
+@pytest.mark.long
 def test_rules_that_stop_early_give_no_bound(short: str) -> None:
     """A figure of an exploration would be published as one of a fixed number of runs."""
     suite = _suite(short, defences=("kf",), attacks=("none",))

@@ -60,6 +60,7 @@ def test_every_car_of_a_platoon_is_asked_for_itself() -> None:
     assert held.values["time"][0, 0] == pytest.approx(place.brief().model.dt)
 
 
+@pytest.mark.long
 def test_a_network_is_asked_about_its_error() -> None:
     """The suite's bound would not be what decides."""
     suite = dataclasses.replace(load_suite("network-v0"), scenarios=("thesis-ch5-v0",), doses=(5,), defences=("dkf",), attacks=("none", "fdi:value=100"))

@@ -129,6 +129,7 @@ def test_the_journal_holds_json_lines_and_nothing_that_runs(straight: tuple[tuni
     assert sorted(p.suffix for p in straight[0].directory.iterdir() if p.is_file()) == [".json", ".jsonl", ".yaml"]
 
 
+@pytest.mark.long
 def test_values_that_a_learner_refuses_cost_their_trial_only(tmp_path: Path) -> None:
     """A population of one has no elite: those trials say so, are not played again, and the others count."""
     search = _search(tmp_path, 5, space={"cem.population": {"choices": [1, 4]}})

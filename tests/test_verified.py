@@ -69,6 +69,7 @@ def test_files_without_rows_are_an_error(tmp_path: Path) -> None:
     assert not (tmp_path / VERIFIED / "report.json").exists()
 
 
+@pytest.mark.long
 def test_a_sample_says_how_many(rows: list[dict[str, Any]], tmp_path: Path) -> None:
     _write(tmp_path, "rows.jsonl", rows)
     _verify(tmp_path, "--sample", "10", "--sample-seed", "1")
@@ -81,6 +82,7 @@ def test_a_sample_says_how_many(rows: list[dict[str, Any]], tmp_path: Path) -> N
     assert words in next((page.parent).glob("*/kf.html")).read_text()
 
 
+@pytest.mark.long
 def test_one_row_that_differs_is_said_of_its_entry(rows: list[dict[str, Any]], tmp_path: Path) -> None:
     k = next(k for k, row in enumerate(rows) if row["defence"] == "kf")
     _write(tmp_path, "rows.jsonl", [*rows[:k], rows[k] | {"min_gap": 99.0}, *rows[k + 1 :]])
@@ -127,7 +129,7 @@ def _published(name: str) -> Any:
     return load(board_in(ROOT / f"results/{name}"))
 
 
-@pytest.mark.thin(5)
+@pytest.mark.thin(15)
 @pytest.mark.parametrize("name", BOARDS)
 def test_a_published_board_is_of_the_suite_that_is_here(name: str) -> None:
     """A suite that changed leaves its board behind until its rows are played again."""

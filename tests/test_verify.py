@@ -41,6 +41,7 @@ def test_honest_rows_are_verified(rows: list[dict[str, Any]]) -> None:
     assert report["findings"] == [] and json.loads(json.dumps(report)) == report
 
 
+@pytest.mark.long
 def test_rows_of_a_version_that_plays_the_same_are_verified_and_scored_with_others(rows: list[dict[str, Any]]) -> None:
     older = [row | {"version": ALIKE[-1]} for row in rows[:9]]
     assert verify(older)["counts"] == {"verified": 9, "differs": 0, "unchecked": 0}

@@ -123,6 +123,7 @@ def test_the_zoo_plays_as_the_file_does() -> None:
     assert attack.learned and attack.sources == [zoo_path(FIRST)]
 
 
+@pytest.mark.long
 def test_a_policy_keeps_its_kinds_where_more_are_granted() -> None:
     """A threat model that grants more kinds of attack changes nothing of what a policy does."""
     own = {"kinds": ["dos_jam", "fdi"], "budget": 20, "fdi_bound": 3.0}
