@@ -5,15 +5,28 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+from functools import cache, partial
 from importlib.resources import files
 from typing import Any
 
+from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
 
 def asset(package: str, *names: str) -> str:
     """Return the text of a package's files, one after the other."""
     return "".join(files(package).joinpath(name).read_text(encoding="utf-8") for name in names)
+
+
+@cache
+def templates(package: str, trim: bool = True) -> Environment:
+    """Return the templates that lie in a package, each compiled once in a process.
+
+    trim: leave out the lines of a template that hold nothing but a statement.
+    """
+    return Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=trim, lstrip_blocks=trim, loader=FunctionLoader(partial(asset, package))
+    )
 
 
 def inline(package: str, *names: str) -> dict[str, Any]:

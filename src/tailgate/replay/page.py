@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
 
-from tailgate.base.assets import asset, embedded, inline
+from tailgate.base.assets import embedded, inline, templates
 from tailgate.base.files import writable_directory, write_atomic
 from tailgate.board.words import names_of
 from tailgate.play.metrics import METRICS, unit_in
@@ -148,11 +147,10 @@ def _measured(value: float | None) -> str:
 
 def render(replay: Replay, source: str = "", agent: int | None = None) -> str:
     """Return the page as text; `agent` is the agent to show first."""
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     here = "tailgate.replay"
     css, js = inline(here, "page.css"), inline(here, "pen.js", "road.js", "lane.js", "string.js", "graph.js", "plots.js", "page.js")
     data = embedded(episode_of(replay, agent))
-    return environment.from_string(asset(here, "page.html")).render(css=css, js=js, data=data, **context_of(replay, source))
+    return templates(here).get_template("page.html").render(css=css, js=js, data=data, **context_of(replay, source))
 
 
 def write_page(replay: Replay, out: Path, source: str = "", agent: int | None = None) -> Path:

@@ -20,7 +20,7 @@ from tailgate.board.schema import Data
 
 from .entry import Replayed, entry_page, replay_of
 from .index import section
-from .pages import Pages, encoded
+from .pages import TITLE, encoded, render
 from .suite import Suite
 
 SUMMARY = "tailgate-site-1"
@@ -66,12 +66,12 @@ def build_site(
     given = list(measured) or [Attachments()] * len(suites)
     attached = [one.belonging(suite.board) for suite, one in zip(suites, given, strict=True)]
     files = {f"{suite.folder}/board.json": encoded(data, "board") for suite, data in zip(suites, boards, strict=True)}
-    folder, pages = writable_directory(Path(out)), Pages(title)
+    folder, title = writable_directory(Path(out)), title or TITLE
     sections = [
         section(suite, one) | {"hash": hashlib.sha256(content).hexdigest()}
         for suite, one, content in zip(suites, attached, files.values(), strict=True)
     ]
-    first = pages.render("index.html", sections=sections, statuses=GROUPS)
+    first = render("index.html", title=title, sections=sections, statuses=GROUPS)
     hashes = {"index.html": hashlib.sha256(first).hexdigest()}
     listed: list[Data] = []
     for suite, one in zip(suites, attached, strict=True):
@@ -86,14 +86,14 @@ def build_site(
                 done = replay_of(entry.worst_episode, folder / replay, f"worst episode of suite {name}", named)
             if done.page:
                 hashes[replay] = hashlib.sha256((folder / replay).read_bytes()).hexdigest()
-            files[page] = pages.render("entry.html", of=entry, suite=suite, entry=entry_page(suite, entry, done, also, one))
+            files[page] = render("entry.html", title=title, of=entry, suite=suite, entry=entry_page(suite, entry, done, also, one))
             listed.append({
                 "suite": name, "defence": entry.defence, "status": entry.status, "class": entry.class_, "page": page,
                 "rank": entry.rank.model_dump() if entry.rank else None, "replay": done.page and replay, "replay_missing": done.why,
                 "critical_dose": {k: v.model_dump() if v else None for k, v in entry.critical_dose.items()},
             })  # fmt: skip
     hashes |= {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
-    summary = {"format": SUMMARY, "title": pages.title, "suites": [s.board.suite.name for s in suites], "entries": listed}
+    summary = {"format": SUMMARY, "title": title, "suites": [s.board.suite.name for s in suites], "entries": listed}
     files["summary.json"] = encoded(summary | {"sha256": dict(sorted(hashes.items()))}, "summary")
     for name, content in files.items():
         write_atomic(folder / name, content)

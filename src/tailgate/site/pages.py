@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 
-from jinja2 import Environment, FunctionLoader, StrictUndefined
+from jinja2 import Environment
 
-from tailgate.base.assets import asset, embedded, inline
+from tailgate.base.assets import embedded, inline, templates
 from tailgate.base.errors import InputError
 from tailgate.board.schema import LEVELS, Data
 from tailgate.board.words import breakable, percent
@@ -17,25 +18,17 @@ HERE = "tailgate.site"
 TITLE = "Tailgate leaderboard"
 
 
-class Pages:
-    """Pages under one title."""
+@cache
+def _templates() -> Environment:
+    made = templates(HERE)
+    made.filters |= {"breakable": breakable, "embedded": embedded, "percent": percent, "figure": figure, "dose": dose_text}
+    made.globals |= {"css": inline(HERE, "page.css"), "js": inline(HERE, "page.js"), "levels": LEVELS, "share_of": share_of}
+    return made
 
-    def __init__(self, title: str | None = None) -> None:
-        self.title = title or TITLE
-        self.environment = Environment(
-            autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-            loader=FunctionLoader(lambda name: asset(HERE, name)),
-        )  # fmt: skip
-        self.environment.filters |= {
-            "breakable": breakable, "embedded": embedded, "percent": percent, "figure": figure, "dose": dose_text,
-        }  # fmt: skip
-        self.environment.globals |= {
-            "css": inline(HERE, "page.css"), "js": inline(HERE, "page.js"), "title": self.title, "levels": LEVELS, "share_of": share_of,
-        }  # fmt: skip
 
-    def render(self, template: str, **values: object) -> bytes:
-        """Return a page. A lone surrogate in the values does not stop it."""
-        return self.environment.get_template(template).render(**values).encode("utf-8", "replace")
+def render(template: str, **values: object) -> bytes:
+    """Return a page. A lone surrogate in the values does not stop it."""
+    return _templates().get_template(template).render(**values).encode("utf-8", "replace")
 
 
 def encoded(data: Data, where: str) -> bytes:

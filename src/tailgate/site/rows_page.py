@@ -17,7 +17,7 @@ from tailgate.core.registry import Entry, entries
 from tailgate.evaluation.summary import summarise
 from tailgate.play.metrics import METRICS
 
-from .pages import Pages, encoded
+from .pages import TITLE, encoded, render
 
 COLUMNS = (  # of the table of every cell, after the crash share: key of the summary, heading
     ("min_gap", "Min. gap [m]"), ("max_error", "Max. error [m]"), ("alarm_onsets", "Alarm onsets"),
@@ -200,14 +200,14 @@ def build(
         "rows": len(rows), "played": sum(row["status"] == "ok" for row in rows), "seeds": spans(row["seed"] for row in rows),
         "purposes": _distinct(rows, "purpose"), "versions": _distinct(rows, "version"), "engines": _distinct(rows, "engine"),
     }  # fmt: skip
-    pages = Pages(title)
+    title = title or TITLE
     columns = [(key, text, METRICS[key].__doc__ or "") for key, text in COLUMNS]
-    page = pages.render(
-        "rows_page.html", columns=columns, facts=facts, headline=_headline(headline), curve=_curve(curve), learned=learned,
+    page = render(
+        "rows_page.html", title=title, columns=columns, facts=facts, headline=_headline(headline), curve=_curve(curve), learned=learned,
         sections=[_section(key, *group, words) for key, group in groups.items()],
         families=[("Defences", _cards(words, "defence")), ("Attacks", _cards(words, "attack"))],
     )  # fmt: skip
-    summary = {"title": pages.title, **facts, "cells": cells, "curve": curve, "headline": headline}
+    summary = {"title": title, **facts, "cells": cells, "curve": curve, "headline": headline}
     folder = writable_directory(Path(out))
     write_atomic(folder / "summary.json", encoded(summary, "summary"))
     write_atomic(folder / "index.html", page)

@@ -8,14 +8,13 @@ import json
 import re
 from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from tailgate.base import sizes
+from tailgate.base.assets import templates
 from tailgate.base.errors import InputError, unknown
 from tailgate.base.files import writable_directory, write_atomic
 from tailgate.base.reading import load_json
@@ -126,9 +125,8 @@ def html(report: Report) -> str:
 
 def page(name: str, **values: object) -> str:
     """Return a page from one of the templates."""
-    loader = FunctionLoader(lambda file: files("tailgate.thesis").joinpath(file).read_text(encoding="utf-8"))
-    made = Environment(autoescape=True, undefined=StrictUndefined, loader=loader)
-    return made.get_template(name).render(flat=flat, prose=prose, base64=lambda figure: base64.b64encode(figure.png).decode(), **values)
+    helpers = {"flat": flat, "prose": prose, "base64": lambda figure: base64.b64encode(figure.png).decode()}
+    return templates("tailgate.thesis", trim=False).get_template(name).render(**helpers, **values)
 
 
 def prose(text: str) -> Markup:
