@@ -15,7 +15,7 @@ from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import Loop, LoopState
 from tailgate.core.score_threshold import Watched
 
-WORTH, MANY = 20_000, 1_000_000  # steps of an agent that justify a traced loop, and a traced attack; tracing takes a second or so
+WORTH, MANY = 20_000, 1_000_000  # steps that justify a traced loop, and a traced attack; tracing takes some tenths of a second
 LONG = 300  # steps of an episode that justify a traced loop; the plain loop takes a millisecond per step, even for one row
 MEMORY = 1e9  # [bytes] of one trace; more episodes are played in several batches
 Player = Callable[[Keys, bool], tuple[Array, dict[str, Array], dict[str, Array]]]  # keys, terminate -> lengths, signals, the road before
@@ -142,7 +142,7 @@ def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True, p
     if not plain and isinstance(watch := loop.defence, Watched):
         seen = rollout(loop.bare, attack, keys, terminate=terminate)
         return dataclasses.replace(seen, signals=seen.signals | {"alarm": watch.alarms(seen.score)})
-    if not plain and (play := _player(loop, attack, len(keys.key) * loop.horizon * loop.model.agents)) is not None:
+    if not plain and (play := _player(loop, attack, len(keys.key) * loop.horizon)) is not None:
         return Trace(loop.model, loop.horizon, *play(keys, terminate), loop.controller.desired_gap)
     state = loop.start(keys)
     plan = attack.prepare(loop.brief)
@@ -158,7 +158,7 @@ def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True, p
 
 
 def _player(loop: Loop, attack: Attack, steps: int) -> Player | None:
-    """Return a function that plays this many steps of an agent faster than the plain loop, or None."""
+    """Return a function that plays this many steps faster than the plain loop, or None."""
     from tailgate.engine.agreement import Untraced
     from tailgate.engine.cards import DeviceError, device
     from tailgate.play.commanded import commanded
@@ -167,7 +167,8 @@ def _player(loop: Loop, attack: Attack, steps: int) -> Player | None:
     here = device()
     if (steps >= MANY or here != "cpu") and not isinstance(whole := rollout_of(loop, attack), Untraced):
         return whole.play
-    if steps >= WORTH or loop.horizon >= LONG or here != "cpu":
+    # agents take longer to trace, and much longer to play
+    if max(steps, steps * loop.model.agents / 3) >= WORTH or loop.horizon >= LONG or here != "cpu":
         if not isinstance(program := commanded(loop), Untraced):
             return partial(program.play, attack)
         if here != "cpu":
