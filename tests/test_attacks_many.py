@@ -61,6 +61,7 @@ def test_without_agents_a_script_hits_all_that_are_granted(sends):
     assert hit(trace)[..., [1, 5]].all() and hit(trace).sum() == 2 * K * 4 and not trace.refused.any()
 
 
+@pytest.mark.long
 def test_chance_is_per_step_and_agent_and_independent(sends):
     """The share of hits is `chance` for each agent, and its square for each pair of agents and for each pair of steps."""
     trace = sends("fdi", seeds=150, chance=0.3)

@@ -208,6 +208,7 @@ def test_a_run_depends_on_its_seed_alone():
     assert not np.array_equal(many.hit[0, :15], many.hit[0, 15:])
 
 
+@pytest.mark.long
 def test_the_three_queries_in_closed_form():
     """1, (100 - 1.04) / 100 and (500 - 51.04) / 500 with limits as invariants; nearly 1 with limits as guards."""
     net, count = load_network("reactive-braking"), 600

@@ -50,6 +50,7 @@ def test_bursts_have_the_chains_statistics():
     assert np.mean(np.array(spans) == 1) == pytest.approx(0.15, abs=0.02)  # geometric
 
 
+@pytest.mark.long
 def test_losses_in_both_states():
     """Elliott's channel: the share of losses is the states' mean, and losses of neighbouring steps go together as the states do."""
     trace = play(BurstLoss(fail=0.05, recover=0.05, loss_good=0.1, loss_bad=0.7), range(64), terminate=False)

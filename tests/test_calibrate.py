@@ -227,6 +227,7 @@ def test_scores_that_are_crowded_or_negative_have_thresholds(how, roads):
     assert odd.threshold == pytest.approx(1.0 - math.exp(-plain.threshold / 2.0) if how == "p" else -1.0 / (1.0 + plain.threshold), rel=1e-3)
 
 
+@pytest.mark.long
 def test_a_negative_score_that_jumps_gets_a_threshold_that_it_can_pass(roads):
     """-3, -2, -1, ...: with -2 it alarms too often, with -1 too rarely."""
     found = calibrate(Odd("steps"), 0.1, scenarios=roads, onsets=20, most_steps=200_000)

@@ -143,6 +143,7 @@ def test_a_late_change_of_the_leader_is_not_predicted():
 # --- the mechanism ---
 
 
+@pytest.mark.long
 def test_the_belief_rolls_back_to_the_last_challenge_that_passed():
     """From detection on it is that of a filter that saw nothing since, with the odometry replayed; before, one that saw all readings."""
     spy = Spy(make("defence", "cra", probability=0.2, watch=1.0, quiet=1))
@@ -195,6 +196,7 @@ def test_several_quiet_challenges_may_be_asked_for():
     assert alarms == [False, True, True, True, True, False, False, True]  # the first step is no challenge
 
 
+@pytest.mark.long
 def test_the_controller_never_gets_the_zero_of_a_challenge():
     """At a challenge the estimate is the prediction, within 2 m of the truth; elsewhere the readings themselves, or with passes=false not."""
     trace = played("cra:probability=0.3", "none", 50)
@@ -206,6 +208,7 @@ def test_the_controller_never_gets_the_zero_of_a_challenge():
     assert np.median(error_of(smooth, 50)) < 0.5 * np.median(error_of(trace, 50))
 
 
+@pytest.mark.long
 def test_the_latency_of_random_challenges_is_geometric():
     """Steps from onset to detection: P(n) = p (1-p)^n, mean (1-p)/p, in 2000 episodes each; a challenge takes a share p of all steps."""
     for p in (0.1, 0.4):
@@ -359,6 +362,7 @@ def test_a_restarted_row_is_a_fresh_one(text, same_tree):
     assert same_tree(kept, after) != [] and all(np.array_equal(a[[1, 3]], b[[1, 3]]) for a, b in zip(leaves(after).values(), leaves(state).values(), strict=True))
 
 
+@pytest.mark.long
 def test_any_filter_predicts(tmp_path, monkeypatch):
     """A name, a mapping, or somebody else's class; a wrong one fails where the defence is made."""
     (tmp_path / "held_filter.py").write_text("from tailgate.estimators import HoldLast\n\nclass Mine(HoldLast):\n    '''As it is.'''\n", encoding="utf-8")

@@ -123,6 +123,7 @@ def test_anything_else_than_step_times_is_refused(tmp_path: Path, change: dict, 
         Clock.read(path)
 
 
+@pytest.mark.long
 def test_the_command_writes_a_table_and_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """The fastest first; --json prints the file. Of some defences alone it prints the figures, and leaves the file as it is."""
     monkeypatch.setattr("tailgate.core.scenario.load_suite", lambda name: SUITE)

@@ -112,6 +112,7 @@ def test_outputs_are_finite_and_of_the_right_shape(defence, short, loop_of):
     assert all(np.isfinite(trace.signals[name]).all() for name in ("estimate", "score", "control", "gap", "wires", "value"))
 
 
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_commands_are_well_formed(attack, short, loop_of, granting):
     """A command has the declared shapes and types, and the attack's memory has B first in every leaf."""
@@ -183,7 +184,7 @@ def test_swapping_the_defence_leaves_the_world_draws(defence, short, play, monke
     np.testing.assert_allclose(noise[0][heard], noise[1][heard], atol=1e-2 if traces[0].model.air else 1e-9)
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("batch", [1, 2, 3, 4, 10])
 @pytest.mark.parametrize("defence", DEFENCES)
 def test_restart(defence, batch, short, loop_of, same_tree):

@@ -116,6 +116,7 @@ def test_trust(host_card: HostCard) -> None:
 LEARNERS = {"cem": "cem={population: 4, episodes: 2, elite: 0.5}", "ppo": "ppo={envs: 8, rollout: 16, batch_size: 64, epochs: 1}"}
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @needs_compiler
 @pytest.mark.parametrize("learner", LEARNERS)

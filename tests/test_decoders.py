@@ -74,6 +74,7 @@ def test_the_decoder_is_as_good_as_an_interior_point_solver(norm):
         assert ours <= _objective(O, Y, z.value, norm) * (1.0 + 3e-5) + 1e-6, trial
 
 
+@pytest.mark.long
 def test_the_optimality_conditions_hold():
     """|sum_i O_i' u_i| is as small as the residuals that are 0 allow."""
     for _ in range(50):
@@ -92,7 +93,7 @@ def test_the_median():
         assert x[0] == pytest.approx(1.1, abs=1e-7)
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(4)
 @pytest.mark.parametrize("s, least", [(0, 40), (1, 40), (2, 38), (3, 33)])
 def test_noise_free_recovery(s, least):
     """Seven sensors of three states, 100 randn on s of them: exact, for s = 3 in most cases; the relaxation may fail. A million times the attack changes nothing."""
@@ -206,6 +207,7 @@ def test_missing_readings_drop_their_rows(linear_model, name):
     assert np.max(np.abs(one[-1][1].x - play_readings(defence, model, ys)[1][-1][1].x)) > 1e-9
 
 
+@pytest.mark.long
 def test_the_fewest_sensors_that_explain():
     """y = (.05, -.05, 9), D = .1: the third, and x = 0; the mixed-integer program agrees on random windows."""
     O, D, there = np.ones((3, 1, 1)), np.full((3, 1), 0.1), np.ones((3, 1), bool)

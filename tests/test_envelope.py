@@ -185,6 +185,7 @@ def test_fresh_clean_runs_leave_no_invariant_too_often(name):
     assert len(z) > 25_000 and (lowest < sheet.made["rate"]).all(), left.max()
 
 
+@pytest.mark.long
 def test_a_large_bias_is_detected_at_once_and_a_slow_ramp_never():
     """The required losing case: 0.01 m a step stays inside of every bound until the position is 4 m off."""
     place = {"scenario": "redundant-two-v0", "seeds": 20, "budget": 50}

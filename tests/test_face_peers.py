@@ -41,7 +41,7 @@ def test_the_autoreset_mode_is_an_attribute_and_an_argument():
             assert env.autoreset_mode is env.metadata["autoreset_mode"] is mode
 
 
-@pytest.mark.thin(3)
+@pytest.mark.thin(2)
 @pytest.mark.parametrize("engine", ["auto", "plain"])
 @pytest.mark.parametrize("autoreset", AUTORESETS)
 def test_a_limit_of_steps_is_that_of_gymnasium(autoreset, engine):

@@ -139,6 +139,7 @@ PLACES = [
 ]  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("in_band", "d", "power"), PLACES)
 @pytest.mark.thin(9)
 def test_the_fast_path_has_the_signals_mean_and_variance(in_band, d, power):

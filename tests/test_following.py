@@ -140,7 +140,7 @@ def test_speeds_are_never_negative_with_noise():
         assert trace.signals[name].min() == 0.0, name
 
 
-@pytest.mark.thin(34)
+@pytest.mark.thin(60)
 @pytest.mark.parametrize("name, defence", LONG)
 def test_nobody_collides_without_an_attack(name, defence):
     """200 clean episodes: neither the car nor the driver behind it."""

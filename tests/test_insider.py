@@ -66,6 +66,7 @@ def test_an_insider_drives_by_the_printed_law_with_other_gains(name):
             np.testing.assert_allclose(trace.control[k, :, i, 0], u, rtol=1e-9, atol=1e-9, err_msg=f"car {i}, step {k + 1}")
 
 
+@pytest.mark.long
 def test_the_car_follows_the_altered_command():
     """The speed and the place of the insider's car are those of a vehicle with lag under its commands, by scipy's matrix exponential."""
     place, attack = dataclasses.replace(place_of(), horizon=200), ATTACK.replace(f"length={LENGTH}", "length=120")

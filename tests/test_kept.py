@@ -61,6 +61,7 @@ def test_scoring_again_keeps_what_rows_do_not_decide(folder: Path, board: Data) 
     assert _scored(folder / "small-v0.yaml", folder) == board
 
 
+@pytest.mark.long
 def test_of_an_entry_whose_cells_changed_nothing_is_kept(folder: Path, board: Data, rows: list[Data]) -> None:
     """Of those whose cells only became more, all is, and the number of cells is told."""
     suite = load_suite(str(folder / "small-v0.yaml"))

@@ -256,6 +256,7 @@ def test_a_bias_on_the_offset_moves_a_car_under_stanleys_law_too():
     assert trace.truth[-1, 0, 0, 0] == pytest.approx(-BIAS, abs=0.02)
 
 
+@pytest.mark.long
 def test_stanleys_law_is_traced_and_fits_its_lane_only():
     loop, rival = loop_of(NAME, "chi2_kf", "fdi:value=0.5")
     place = stanley().with_threat(knowledge="black")

@@ -134,6 +134,7 @@ def test_a_resumed_run_gives_the_policy_of_an_uninterrupted_one(name: str, paid:
     assert a.with_suffix(".safetensors").read_bytes() == b.with_suffix(".safetensors").read_bytes()
 
 
+@pytest.mark.long
 @pytest.mark.thin(3)
 @pytest.mark.parametrize("name", SMALL)
 def test_two_runs_of_one_seed_are_equal_and_of_two_seeds_are_not(

@@ -170,6 +170,7 @@ def test_what_the_defender_sees_is_what_it_has():
     assert set(duel.told(state)) == {"step", "threshold", "mode"}
 
 
+@pytest.mark.long
 def test_payoffs():
     """zero_sum is minus the attacker's reward; safety is the costs of care by hand, and -1 at a collision."""
     attack = {"scenario": "gusty-stop-and-go-v0", "interval": 5, "threat": {"kinds": ["dos_hold"]}, "menu": {"thresholds": [1.0], "modes": ["brake"]}}

@@ -138,6 +138,7 @@ def test_cars_settle_at_the_desired_gap_from_perfect_estimates(name, topology):
     np.testing.assert_allclose(trace.speed[-1], 20.0, atol=0.02)
 
 
+@pytest.mark.long
 def test_everybody_stops_behind_a_leader_that_stops_and_nobody_rolls_back():
     """After the braking the first cars stand d_r apart, no speed is ever negative, no position ever falls."""
     trace = play(place_of(horizon=800), seeds=range(8))

@@ -49,6 +49,7 @@ def test_the_pictures_show_the_figures():
         assert one.shape != two.shape or (one != two).any()
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)  # the other form: test_export_board
 @pytest.mark.parametrize("form, start", [("svg", b"<?xml"), ("pdf", b"%PDF")])
 def test_vectors_repeat(form, start, tmp_path):

@@ -158,6 +158,7 @@ def test_ten_thousand_runs_behind_a_leader_stay_inside_of_the_tube():
     assert kept == 1.0 and used > 0.1
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("noise", [None, "uniform"])
 def test_ten_thousand_runs_stay_inside_of_the_gaussian_tube_whatever_the_law_of_the_sensor(noise):

@@ -102,6 +102,7 @@ def test_parameters_out_of_range_are_refused(attack):
         Spec("attack", attack).make()
 
 
+@pytest.mark.long
 def test_conditions_and_chance_work_as_for_every_script():
     """A late echo only while the gap is small; with chance 0.3 in 30 % of the open steps."""
     trace = played("echo_delay:delay=1,trigger=near,threshold=60", seeds=range(10))

@@ -153,6 +153,7 @@ def test_a_plant_that_begins_at_one_speed_is_refused():
         scenario.loop(Spec("defence", "kf").make())
 
 
+@pytest.mark.long
 @pytest.mark.thin(6)
 @pytest.mark.parametrize("name", ["road-following-v0", "road-string-v0", "road-us06-v0", "road-aeb-own-v0", "road-aeb-shared-v0"])
 def test_the_engine_plays_the_same_bits(name):

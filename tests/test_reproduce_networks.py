@@ -67,7 +67,7 @@ def test_chapter_5_clean_convergence(systems):
     assert low >= 5 and high <= 9
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(4)
 @pytest.mark.parametrize(
     ("case", "guard", "figure", "digits"), [("dos", "lasso", 0.72, 2), ("dos", "dkf", 9.9, 1), ("fdi", "lasso", 0.56, 2), ("fdi", "dkf", 4.8, 1)]
 )
@@ -93,7 +93,7 @@ def test_chapter_6_clean():
     assert np.quantile(ch6_cases.Played(trace).own[9].max(axis=1), 0.975) < 0.01
 
 
-@pytest.mark.thin(6)
+@pytest.mark.thin(9)
 @pytest.mark.parametrize("guard", list(ch6_loop.DEFENCES))
 @pytest.mark.parametrize("label", list(DESIGN))
 def test_chapter_6_collisions(label, guard):

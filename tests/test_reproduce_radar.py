@@ -60,6 +60,7 @@ def test_the_figures_of_the_design(runs):
         assert low - 0.005 <= 5.03 <= high + 0.005
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("at", "figure"), [(60.0, 0.3), (100.0, 0.8)])
 def test_scenario_ii_with_the_reset(at, figure):
     """The design: 0.3 and 0.8 m for a change at 60 and 100 s, as it rounds them; without the reset hundreds of metres."""

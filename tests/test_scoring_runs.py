@@ -228,6 +228,7 @@ def test_the_looser_threshold_lets_a_stealthy_attacker_further() -> None:
     assert stealth_impact(ROAD, "none", few(0.02)) is None
 
 
+@pytest.mark.long
 def test_of_a_deviation_that_is_missing_the_reason_is_given() -> None:
     """`imm` shows no gate to stay below; a mean time that is out of reach has no threshold; five episodes have a median without limits."""
     [shut] = stealth_impact(ROAD, "imm", few(0.02, episodes=2))

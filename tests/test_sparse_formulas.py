@@ -212,6 +212,7 @@ def test_a_watermark_marks_actuators_only():
     assert shares[0] < 0.5 and shares[1] > 0.9
 
 
+@pytest.mark.long
 def test_a_watermark_is_a_part_of_the_command_and_known_to_the_filter():
     """The watermark's variance adds to that of the command; the clean score stays as it is; sd = 0 gives the plain filter."""
     place = load_scenario("stop-and-go-v0").with_threat(kinds=("replay",), knowledge="black")

@@ -203,6 +203,7 @@ def test_parameters_of_other_values_are_traced_once(monkeypatch):
     assert play("chi2_kf", "fdi:trigger=near,threshold=50,value=3", 20) == before + 3  # other functions
 
 
+@pytest.mark.long
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("names", [("car-following-noisy-v0", "car-following-late-v0"), ("car-following-lossy-v0", "car-following-noisy-v0")])
 def test_a_state_of_another_form_has_another_program(names, monkeypatch):

@@ -78,6 +78,7 @@ def _depth(f: Formula) -> int:
     return (not isinstance(f, Atom | And | Or | Not)) + max((_depth(part) for part in f.parts), default=0)
 
 
+@pytest.mark.long
 @settings(max_examples=300, deadline=None)
 @given(_formulas().filter(lambda f: _depth(f) <= 3), _episodes())
 def test_both_semantics_keep_to_their_definitions_and_agree_in_sign(formula: Formula, episodes: Samples) -> None:

@@ -233,6 +233,7 @@ def test_another_limit_of_false_alarms_can_be_stated(short: str) -> None:
     assert found["demands"]["false_alarms"] == 1e-5 and _detects(found["defences"][0])["share"]["k"] == 6 and found["defences"][0]["trust"]["black"]
 
 
+@pytest.mark.long
 def test_who_names_no_clean_run_is_judged_by_one_all_the_same(short: str) -> None:
     """A random alarm would count where nobody looked at it without an attack."""
     found = check(_suite(short, defences=("chi2_kf", AT_RANDOM), attacks=(SEEN,)), runs=6)

@@ -51,6 +51,7 @@ def _write(folder: Path, name: str, rows: list[dict[str, Any]]) -> None:
     (folder / name).write_bytes(encode(rows))
 
 
+@pytest.mark.long
 def test_rows_that_come_out_equal_are_said_of_their_entries(rows: list[dict[str, Any]], tmp_path: Path) -> None:
     _write(tmp_path, "rows.jsonl", rows)
     assert _verified(tmp_path) == {"none": None, "kf": None}

@@ -66,7 +66,7 @@ GROUPS = {name.rpartition("-")[0]: name for name in reversed(zoo_names())}  # th
 LONG = ("highway", "platoon")  # ten seconds to a minute each
 
 
-@pytest.mark.thin(40)
+@pytest.mark.thin(60)
 @pytest.mark.parametrize("group", [pytest.param(name, marks=[pytest.mark.long] if name.startswith(LONG) else []) for name in sorted(GROUPS)])
 def test_the_recorded_outcome_is_what_the_policy_does(group: str) -> None:
     """Of every search the first policy, played again on the report seeds, has its recorded mean, and no attack has its own."""
