@@ -195,7 +195,7 @@ def figures(played: Played, dt: float) -> dict[str, Any]:
     steps = trace.alarm.shape[0]
     counts = (np.arange(1, steps + 1)[:, None] < held.length) & (np.arange(1, steps + 1)[:, None] * dt > SETTLING)  # (K, R)
     alarm = trace.alarm[:, :, 0] & counts
-    rises = alarm & ~np.concatenate([np.zeros((1, alarm.shape[1]), bool), trace.alarm[:-1, :, 0]])
+    rises = alarm & ~np.concatenate([np.zeros((1, alarm.shape[1]), bool), alarm[:-1]])  # one that is on when the filter has settled counts
     hours, onsets = float(counts.sum() * dt / 3600.0), int(rises.sum())
     estimate, smooth = trace.estimate[:, :, 0, :2], np.moveaxis(played.smooth, 0, 1)[1 : steps + 1]
     off = estimate - smooth
