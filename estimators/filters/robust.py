@@ -84,26 +84,24 @@ def _pivot(r: Array, W: Array, half: Array, size: Array) -> Array:
     correlated.) r, half and size (B, N, q), W (B, N, q, q).
     """
     q = r.shape[-1]
-    sensors = range(q)
+    sensors = np.arange(q)
 
     def step(sign: Array, y: Array, fewest: Array, left: Array) -> tuple[Array, list[Array]]:
         y = _solved(sign, r, W, half)
-        wrong, toward = [], []
-        for i in sensors:
-            g, largest = np.zeros(y.shape[:-1]), np.zeros(y.shape[:-1])
-            for j in sensors:
-                part = W[..., i, j] * y[..., j]
-                g, largest = g + part, np.maximum(largest, np.abs(part))
-            beyond = np.abs(g) > half[..., i] + (TOLERANCE * half[..., i] + ROUNDING * largest)
-            slack = TOLERANCE * half[..., i] * size[..., i] + ROUNDING * (np.abs(r[..., i]) + np.abs(y[..., i]))
-            wrong.append(np.where(sign[..., i] == 0.0, beyond, sign[..., i] * (r[..., i] - y[..., i]) < -slack))
-            toward.append(np.where(sign[..., i] == 0.0, np.copysign(1.0, g), 0.0))
+        g, largest = np.zeros(y.shape), np.zeros(y.shape)
+        for j in range(q):
+            part = W[..., j] * y[..., j : j + 1]
+            g, largest = g + part, np.maximum(largest, np.abs(part))
+        beyond = np.abs(g) > half + (TOLERANCE * half + ROUNDING * largest)
+        slack = TOLERANCE * half * size + ROUNDING * (np.abs(r) + np.abs(y))
+        wrong = np.where(sign == 0.0, beyond, sign * (r - y) < -slack)
+        toward = np.where(sign == 0.0, np.copysign(1.0, g), 0.0)
         count, last = np.zeros(left.shape, np.int64), np.zeros(left.shape, np.int64)
-        for i in sensors:
-            count, last = count + wrong[i], np.where(wrong[i], i, last)
+        for i in range(q):
+            count, last = count + wrong[..., i], np.where(wrong[..., i], i, last)
         left, fewest = np.where(count < fewest, PATIENCE, left - 1), np.minimum(count, fewest)
-        changed = [np.where(wrong[i] & ((left >= 0) | (last == i)), toward[i], sign[..., i]) for i in sensors]
-        return count > 0, [num.stack(changed), y, fewest, left]
+        changed = np.where(wrong & ((left >= 0)[..., None] | (last[..., None] == sensors)), toward, sign)
+        return count > 0, [changed, y, fewest, left]
 
     alone = np.where(np.abs(r) > half * size, np.copysign(1.0, r), 0.0)  # sign that each sensor alone would have
     whole = np.zeros(r.shape[:-1], np.int64)
@@ -118,32 +116,30 @@ def _pivot(r: Array, W: Array, half: Array, size: Array) -> Array:
 def _solved(sign: Array, r: Array, W: Array, half: Array) -> Array:
     """Return y (B, N, q) for presumed signs: an outlier is at its price, any other sensor is believed."""
     q = r.shape[-1]
-    out = [sign[..., i] != 0.0 for i in range(q)]
-    y = [np.where(out[i], 0.0, r[..., i]) for i in range(q)]
-    L: list[list[Array]] = []  # L L' = W of the outliers, 1 for the others
-    for i in range(q):
-        L.append([])
-        for j in range(i + 1):
-            both = out[i] & out[j]
-            held = W[..., i, j]
-            for k in range(j):
-                held = held - L[i][k] * L[j][k]
-            held = np.where(both, held, 1.0 if i == j else 0.0)
-            L[i].append(np.sqrt(held) if i == j else held / L[j][j])
+    out, price = sign != 0.0, sign * half
+    y = np.where(out, 0.0, r)
+    L: list[Array] = []  # columns from the diagonal down: L L' = W of the outliers, 1 for the others
+    for j in range(q):
+        held = W[..., j:, j]
+        for k in range(j):
+            held = held - L[k][..., j - k :] * L[k][..., j - k : j - k + 1]
+        held = np.where(out[..., j:] & out[..., j : j + 1], held, np.eye(1, q - j)[0])
+        root = np.sqrt(held[..., :1])
+        L.append(np.concatenate([root, held[..., 1:] / root], axis=-1))
     for _ in range(2):  # the second time mends the rounding of the first
-        z: list[Array] = []
+        part, left, z = W * y[..., None, :], price, list[Array]()
         for i in range(q):
-            held = sign[..., i] * half[..., i]
-            for j in range(q):
-                part = W[..., i, j] * y[j] + (L[i][j] * z[j] if j < i else 0.0)
-                held = np.where(out[i], held - part, held)
-            z.append(held / L[i][i])
+            held = left[..., 0]
+            for j in range(i, q):
+                held = held - part[..., i, j]
+            z.append(np.where(out[..., i], held, price[..., i]) / L[i][..., 0])
+            left = left[..., 1:] - (part[..., i + 1 :, i] + L[i][..., 1:] * z[i][..., None])
         for i in reversed(range(q)):
             for k in range(i + 1, q):
-                z[i] = z[i] - L[k][i] * z[k]
-            z[i] = z[i] / L[i][i]
-        y = [y[i] + z[i] for i in range(q)]
-    return num.stack(y)
+                z[i] = z[i] - L[i][..., k - i] * z[k]
+            z[i] = z[i] / L[i][..., 0]
+        y = y + num.stack(z)
+    return y
 
 
 @cache
