@@ -8,6 +8,7 @@ import pytest
 
 from tailgate.base.errors import InputError
 from tailgate.cli import main
+from tailgate.roads.fcd import fcd
 from tailgate.roads.readers import Choice, mapping_of, read
 from tailgate.roads.recording import Raw, checked
 
@@ -40,6 +41,42 @@ def test_a_string_gives_a_recording_for_each_follower():
     assert [r.name for r in read("asta-braking")] == ["car 2", "car 3", "car 4", "car 5"]
     assert [r.name for r in read("asta-braking", choice=Choice(vehicle="4"))] == ["car 4"]
     assert read("comma2k19-radar")[0].repairs == {"samples interpolated to even times": 1055}
+
+
+def test_an_address_that_another_car_gets_is_another_track(tmp_path):
+    can = logs.comma(tmp_path) / "processed_log" / "CAN" / "radar"
+    values = np.load(can / "value")
+    values[200:, 0] += 40.0
+    values[200, 6] = 1.0
+    logs.save(can / "value", values)
+    (found,) = read(str(tmp_path))
+    assert found.samples == 400 and found.segments[0].begin == pytest.approx(20.0) and np.abs(found.segments[0].gap - 40.0 - logs.GAP[200:]).max() < 2e-3
+
+
+def test_a_silent_or_oncoming_sender_is_not_seen(tmp_path):
+    lines = [json.loads(line) for line in logs.veremi().splitlines()]
+    quiet = [line for line in lines if line["type"] == 2 or not 10.0 < line["rcvTime"] < 30.0]
+    (found,) = _read(tmp_path, "veremi", "\n".join(map(json.dumps, quiet)))
+    seen = found.segments[0].seen
+    assert not seen[102:299].any() and seen[:100].all() and seen[301:].all()
+    for line in lines:
+        if line["type"] == 3 and line["rcvTime"] < 20.0:
+            line["spd"][0] *= -1.0
+    (found,) = _read(tmp_path, "veremi", "\n".join(map(json.dumps, lines)))
+    assert not found.segments[0].seen[:199].any() and found.segments[0].seen[201:].all()
+
+
+def test_a_car_between_two_others_is_seen_in_place_of_the_first(tmp_path):
+    x = np.stack([logs.X_LEAD + 60.0, np.where(logs.T < 40.0, logs.X_LEAD + 90.0, logs.X_LEAD + 32.0), logs.X_OWN], axis=1)
+    v = np.stack([logs.LEAD, logs.LEAD, logs.OWN], axis=1)
+    (found,) = read(_file(tmp_path, "a.xml", fcd(0.1, ["first", "second", "me"], x, v, 0.0 * v)), choice=Choice(vehicle="me", lead="first"))
+    assert found.segments[0].seen[:399].all() and not found.segments[0].seen[401:].any()
+
+
+def test_short_trajectories_among_others_are_dropped_and_counted(tmp_path):
+    short = [line.replace("7,", "8,", 1) for line in logs.ultra_av().splitlines()[1:16]]
+    (found,) = _read(tmp_path, "ultra-av", logs.ultra_av() + "\n".join(short) + "\n")
+    assert found.samples == len(logs.T) and found.repairs == {"recordings below 5 s or 20 samples dropped": 1}
 
 
 def test_repairs_are_counted():

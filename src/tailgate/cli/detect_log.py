@@ -87,6 +87,7 @@ def _tables(rows: list[dict[str, Any]]) -> None:
         interval = f"{_text(row['alarms_per_hour_low'])} to {_text(row['alarms_per_hour_high'])}"
         alarms = (_text(row["alarms_per_hour"]), interval) if row["attack"] == "none" else ("", "")  # under attack they are not false
         detected = f"{row['detected']} of {row['attacked']}" if "detected" in row else ""
+        detected += f", {early} on before" if (early := row.get("alarmed_before")) else ""
         lines.append((
             row["recording"], row["defence"], row["attack"], _text(row["hours"], 3), *alarms,
             f"{100 * row['alarm_share']:.1f} %", _text(row["gap_error"], 3), _text(row["speed_error"], 3), detected,

@@ -94,12 +94,12 @@ def read_fcd(path: Path, vehicle: str | None, lead: str | None, length: float) -
     times = sorted(held.seen[me])
     rows = []
     for t in times:
-        lane, place, speed = held.seen[me][t]
-        there = held.seen[other].get(t)
-        if there is None or there[0] != lane or there[1] <= place:
+        _, place, speed = held.seen[me][t]
+        if ahead.get((me, t)) != other:
             rows.append((t, np.nan, np.nan, speed))
         else:
-            rows.append((t, there[1] - length - place, there[2] - speed, speed))
+            _, there, fast = held.seen[other][t]
+            rows.append((t, there - length - place, fast - speed, speed))
     columns = np.array(rows).T
     return [Raw(f"vehicle {me} behind {other}", *columns)]
 

@@ -25,7 +25,7 @@ from tailgate.base.reading import lines_of, parse_json, read_bytes
 from tailgate.core import Array
 from tailgate.core.traces import cards, npy, trace
 from tailgate.roads.fcd import read_fcd
-from tailgate.roads.recording import MOST, Raw, Recording, checked
+from tailgate.roads.recording import FEWEST, LEAST, MOST, Raw, Recording, checked
 
 FORMATS = ("openacc", "ultra-av", "comma2k19", "sumo-fcd", "veremi", "csv", "trace")
 TIMES, LENGTHS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}, {"m": 1.0, "km": 1000.0, "ft": 0.3048}
@@ -34,6 +34,7 @@ UNITS = TIMES | LENGTHS | SPEEDS
 WANTED = {"t": TIMES, "gap": LENGTHS, "speed": SPEEDS, "relative_speed": SPEEDS, "lead_speed": SPEEDS}  # and their units
 HEADER = 20  # lines before the header of an OpenACC file, at most
 LENGTH = 5.0  # of a vehicle whose length nobody tells [m]
+SILENCE = 2.5  # times the usual time between two messages: nothing is interpolated across a longer one
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,10 @@ def read(source: str, format: str | None = None, choice: Choice = Choice()) -> l
         if isinstance(error, InputError):
             raise
         raise InputError(f"{kind} file", source, f"a readable one ({said(error)})") from None
-    found = [checked(raw, f"{kind} file {path.name}") for raw in raws]
+    long = [raw for raw in raws if len(raw.t) >= FEWEST and not raw.t[-1] - raw.t[0] < LEAST] or raws
+    found = [checked(raw, f"{kind} file {path.name}") for raw in long]
+    if dropped := len(raws) - len(long):
+        found[0].repairs[f"recordings below {LEAST:g} s or {FEWEST} samples dropped"] = dropped
     return [dataclasses.replace(one, name=one.name or path.name) for one in found]
 
 
@@ -241,12 +245,18 @@ def _comma(path: Path, choice: Choice) -> list[Raw]:
         raise InputError("comma2k19 file radar/value", values.shape, f"({len(t)}, 7): distances, relative speed, address, new track")
     if len(speed) != len(at) or not (np.diff(at) > 0).all():
         raise InputError(f"comma2k19 file {own.name}/t", len(at), f"rising times, as many as values ({len(speed)})")
-    tracks = Counter(values[:, 5].astype(np.int64).tolist())
-    if choice.vehicle is not None and choice.vehicle not in map(str, tracks):
-        raise unknown("comma2k19 file: --vehicle", choice.vehicle, map(str, tracks))
-    chosen = int(choice.vehicle) if choice.vehicle is not None else max(tracks, key=lambda key: (tracks[key], -key))
-    mine = (values[:, 5] == chosen) & (t >= at[0]) & (t <= at[-1])
-    return [Raw(f"track {chosen}", t[mine], values[mine, 0], values[mine, 2], np.interp(t[mine], at, speed))]
+    addresses = values[:, 5].astype(np.int64)
+    if choice.vehicle is not None and choice.vehicle not in map(str, set(addresses.tolist())):
+        raise unknown("comma2k19 file: --vehicle", choice.vehicle, map(str, sorted(set(addresses.tolist()))))
+    begun = Counter[int]()  # tracks of each address: the radar gives one to another car where it says that the track is new
+    tracks: list[tuple[int, int]] = []
+    for address, new in zip(addresses.tolist(), values[:, 6] != 0.0, strict=True):
+        begun[address] += int(new)
+        tracks.append((address, begun[address]))
+    long = Counter(track for track in tracks if choice.vehicle in (None, str(track[0])))
+    chosen = max(long, key=lambda track: (long[track], -track[0], -track[1]))
+    mine = np.array([track == chosen for track in tracks]) & (t >= at[0]) & (t <= at[-1])
+    return [Raw(f"track {chosen[0]}", t[mine], values[mine, 0], values[mine, 2], np.interp(t[mine], at, speed))]
 
 
 def _veremi(path: Path, choice: Choice) -> list[Raw]:
@@ -279,12 +289,14 @@ def _veremi(path: Path, choice: Choice) -> list[Raw]:
     at, there, fast = _columns(heard[wanted])
     order = np.argsort(at, kind="stable")
     at, there, fast = at[order], there[order], fast[order]
-    known = (t >= at[0]) & (t <= at[-1])
-    ahead_at = np.stack([np.interp(t, at, there[:, i]) for i in range(2)], axis=1)
-    speed, lead = np.sqrt((v * v).sum(axis=1)), np.interp(t, at, np.sqrt((fast * fast).sum(axis=1)))
-    off = ahead_at - x
+    there, fast = (np.stack([np.interp(t, at, column) for column in part.T], axis=1) for part in (there, fast))
+    speed, lead = np.sqrt((v * v).sum(axis=1)), np.sqrt((fast * fast).sum(axis=1))
+    off = there - x
     gap = np.sqrt((off * off).sum(axis=1)) - choice.length
-    ahead = (off * v).sum(axis=1) >= 0.0
+    before, after = (np.clip(i, 0, len(at) - 1) for i in (np.searchsorted(at, t, "right") - 1, np.searchsorted(at, t)))
+    usual = float(np.median(np.diff(at))) if len(at) > 1 else 0.0
+    known = (t >= at[0]) & (t <= at[-1]) & (at[after] - at[before] <= SILENCE * usual)
+    ahead = ((off * v).sum(axis=1) >= 0.0) & ((fast * v).sum(axis=1) >= 0.0)  # in front, and no oncoming car
     return [Raw(f"sender {wanted}", t, np.where(known & ahead, gap, np.nan), np.where(known & ahead, lead - speed, np.nan), speed)]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from tailgate.base.errors import InputError
 from tailgate.core import Array
 
-LEAST = 5.0  # shortest segment that is kept [s]
+LEAST, FEWEST = 5.0, 20  # shortest segment that is kept [s], and the fewest samples of a recording
 RATE = (0.005, 2.0)  # admitted distance of samples [s]
 FASTEST = 100.0  # admitted speed [m/s]
 HURRIED = 60.0  # typical speed that is more likely in another unit [m/s]
@@ -80,8 +80,8 @@ def checked(raw: Raw, where: str) -> Recording:
     name = f"{where}: {raw.name}" if raw.name else where
     repairs: dict[str, int] = {}
     t = raw.t
-    if len(t) < 20:
-        raise InputError(f"{name}: samples", len(t), "at least 20")
+    if len(t) < FEWEST:
+        raise InputError(f"{name}: samples", len(t), f"at least {FEWEST}")
     if len(t) > MOST:
         raise InputError(f"{name}: samples", len(t), f"at most {MOST}")
     if not np.isfinite(t).all():
