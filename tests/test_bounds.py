@@ -76,7 +76,6 @@ def test_the_jump_grows_while_the_gate_is_shut(model):
 
 
 @pytest.mark.long
-@pytest.mark.thin(5)
 @pytest.mark.parametrize("index", [0, 1])
 @pytest.mark.parametrize("steps", [1, 5, 40])
 def test_the_stealth_bound_is_reached_and_not_passed(model, steps, index):

@@ -203,7 +203,6 @@ def test_laws_are_refused_without_a_platoons_messages(name):
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", LAWS)
-@pytest.mark.thin(4)
 def test_cars_that_fall_back_stop_behind_a_leader_that_brakes(name):
     """A platoon that never uses a message keeps its distance through the braking to a stop."""
 

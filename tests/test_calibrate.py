@@ -77,7 +77,6 @@ def test_onsets_are_those_of_the_metric(short):
 
 
 @pytest.mark.long
-@pytest.mark.thin(3)
 @pytest.mark.parametrize(("defence", "scenario"), [("chi2_kf", "braking-v0"), ("imm", "stop-and-go-v0"), ("cusum_kf", "radar-braking-v0")])
 def test_the_plain_loop_finds_the_same_threshold(monkeypatch, defence, scenario):
     """To the last digit, with the same alarms in as many steps."""
@@ -218,7 +217,6 @@ def _of_fifty(defence, roads):
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("how", ["p", "negative"])
 def test_scores_that_are_crowded_or_negative_have_thresholds(how, roads):
     """With as many digits as it takes: the same alarms as those of the score that they are made of."""

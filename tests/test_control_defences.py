@@ -203,7 +203,6 @@ def test_falsified_accelerations_collide_without_the_clip_and_not_with_it():
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("sides", ["above", "both"])
 def test_the_command_stays_within_the_bound_of_the_own_law(sides):
     """Recomputed from what was received: at most `bound` above, and with both sides below, within the own law's limits."""

@@ -117,7 +117,6 @@ LEARNERS = {"cem": "cem={population: 4, episodes: 2, elite: 0.5}", "ppo": "ppo={
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @needs_compiler
 @pytest.mark.parametrize("learner", LEARNERS)
 def test_a_training_ends_in_the_same_policy(learner: str, host_card: HostCard, tmp_path: Any) -> None:

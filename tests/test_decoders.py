@@ -61,7 +61,6 @@ def _problem(trial):
 
 @pytest.mark.long
 @pytest.mark.parametrize("norm", [2, 1])
-@pytest.mark.thin(2)
 def test_the_decoder_is_as_good_as_an_interior_point_solver(norm):
     """60 random problems, degenerate ones among them: after 2000 rounds the objective is Clarabel's, to 3e-5 where signs all but balance."""
     cp = pytest.importorskip("cvxpy")
@@ -230,7 +229,6 @@ def test_feasible_is_what_a_grid_finds():
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("centre", ["least_squares", "chebyshev"])
 def test_honest_errors_within_their_bounds_never_alarm_and_move_the_estimate_by_less_than_the_bound(centre):
     """250 draws for least squares, 100 for the linear program: nobody is blamed, and |error| <= l0_bound."""

@@ -244,7 +244,6 @@ def blind_by_hand(model):
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("gain", ["steady", "varying"])
 @pytest.mark.parametrize("directed", [False, True])
 def test_who_cannot_know_the_state_is_named(gain, directed):
@@ -341,7 +340,6 @@ class Halting(Platoon):
 
 
 @pytest.mark.long
-@pytest.mark.thin(3)
 @pytest.mark.parametrize(("name", "command", "fits"), [("lasso_dkf", 4.73, 0.18), ("norm_resilient", 5.27, 0.15), ("chi2_dkf:gain=steady", 21.8, 0.25)])
 def test_the_clean_error_of_the_braking_platoon_is_its_leaders_halt(name, command, fits):
     """A lag under -4 m/s^2 and then 0 rolls backwards; no filter that bounds its corrections is slow where the input fits."""

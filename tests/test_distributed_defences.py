@@ -65,7 +65,6 @@ def test_without_attack_and_noise_they_converge(defence):
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("gain", ["varying", "steady"])
 def test_a_gate_that_never_shuts_is_no_gate(gain, same_bits):
     """chi2_dkf with an enormous eta has the bits of dkf; with a tiny one it uses no reading."""
@@ -174,7 +173,6 @@ def test_saturation_counts_the_readings_that_are_used():
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("centre", ["median", "own"])
 def test_who_never_disagrees_is_fused_as_ever(centre, same_bits):
     """disagreement_dkf with an enormous threshold has the bits of chi2_dkf."""

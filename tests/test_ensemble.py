@@ -75,7 +75,6 @@ def assert_same(place, found, wanted, text):
 
 
 @pytest.mark.long
-@pytest.mark.thin(6)
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.thin(2) if name in ("platoon", "network") else ()) for name in PLACES]
 )

@@ -170,7 +170,6 @@ def test_no_alarm_in_the_runs_that_it_was_learned_from(learned):
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", SHIPPED)
 def test_fresh_clean_runs_leave_no_invariant_too_often(name):
     """No invariant is left surely more often than the rate that was asked for, if steps were independent. They are not."""

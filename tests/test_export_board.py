@@ -90,7 +90,6 @@ def test_bibtex_names_the_board_and_its_version() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize(("form", "start"), [("pdf", b"%PDF"), ("svg", b"<?xml")])
 def test_pictures_are_vectors_and_repeat(form: str, start: bytes, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")

@@ -268,7 +268,6 @@ def test_the_game_is_shown_in_a_window(monkeypatch):
 
 @pytest.mark.long
 @pytest.mark.parametrize("autoreset", AUTORESETS)
-@pytest.mark.thin(4)
 def test_pictures_of_the_fast_engine_are_those_of_the_plain_loop(autoreset, brief):
     """Looked at now and then, through collisions, ends and resets by mask: the same pixels, and not one bit of another step."""
     pytest.importorskip("PIL")

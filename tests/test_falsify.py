@@ -193,7 +193,6 @@ def test_a_schedule_plays_what_was_recorded():
     ({"commands": [{"k": 9, "kind": "fdi", "hits": [{"agent": 7, "wire": "position", "value": 1}]}]}, "an agent below"),
     ({"property": "G gap >"}, "a number"), ({"property": "G error < 3 and y"}, "."),
 ])  # fmt: skip
-@pytest.mark.thin(12)
 def test_a_damaged_counterexample_is_refused(tmp_path, changes, expected):
     falsify(Search(dataclasses.replace(ROAD, formula="G[0,60] gap > 20"), trials=2), tmp_path)
     path = tmp_path / run.COUNTEREXAMPLE

@@ -101,7 +101,6 @@ def _energy_gain(filter_, model):
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", ["gusty-stop-and-go-v0", "thesis-ch4-v0"])
 def test_h_infinity_keeps_its_bound(name):
     """The worst energy gain from disturbances to the error of C x is below 1/gamma, and below the Kalman filter's."""

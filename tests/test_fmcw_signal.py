@@ -141,7 +141,6 @@ PLACES = [
 
 @pytest.mark.long
 @pytest.mark.parametrize(("in_band", "d", "power"), PLACES)
-@pytest.mark.thin(9)
 def test_the_fast_path_has_the_signals_mean_and_variance(in_band, d, power):
     """Of both readings, and the share of outliers, within 99.9 %: far above, in and below the threshold region."""
     radar = dataclasses.replace(SHARP, in_band=in_band)

@@ -26,7 +26,6 @@ def _received(y, valid=None):
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("factors", [(1.0, 4.0, 900.0), (1.0, 100.0)])
 def test_it_equals_filterpys_over_100_steps(factors, linear_model):
     """Estimate, every model's x and P, and the mode probabilities within 1e-9, on random matrices and data with outliers."""

@@ -178,7 +178,6 @@ def test_learners_do_not_choose_it():
 
 
 @pytest.mark.long
-@pytest.mark.thin(3)
 @pytest.mark.parametrize("law", LAWS)
 def test_the_traced_engine_plays_it_to_the_bit(law, tmp_path, monkeypatch):
     """With the attack in plain code, and traced as well."""
@@ -201,7 +200,6 @@ def growth(kp, kd, headway, tau, dt):
 
 
 @pytest.mark.long
-@pytest.mark.thin(4)
 @pytest.mark.parametrize("scale", [-0.1, -0.15, -0.25, -0.3])
 def test_the_gain_at_which_a_car_swings_is_the_closed_form(scale):
     """The first follower. Routh: tau s^3 + (1 + kd h) s^2 + (kd + kp h) s + kp is stable

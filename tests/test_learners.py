@@ -92,7 +92,6 @@ def test_it_learns_when_to_attack(name: str, decisions: int, paid: dict[str, Any
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize(("name", "least"), [("sac", 1.0), ("tqc", 0.35)])
 def test_it_learns_what_to_inject(name: str, least: float, paid: dict[str, Any], tmp_path: Path) -> None:
     """Where every second of error pays: rest earns 0.19, and the policy much more; tqc moves a value by at most 0.5 in a step."""
@@ -135,7 +134,6 @@ def test_a_resumed_run_gives_the_policy_of_an_uninterrupted_one(name: str, paid:
 
 
 @pytest.mark.long
-@pytest.mark.thin(3)
 @pytest.mark.parametrize("name", SMALL)
 def test_two_runs_of_one_seed_are_equal_and_of_two_seeds_are_not(
     name: str, paid: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -258,7 +258,6 @@ def test_the_card_and_the_schema_describe_every_column(made: tuple[Path, dict[st
 
 
 @pytest.mark.long
-@pytest.mark.thin(3)
 @pytest.mark.parametrize(
     ("scenario", "defence", "attack", "names"),
     [

@@ -45,7 +45,6 @@ def test_no_truth_of_its_own_changes_nothing() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", [n for n in list_scenarios() if load_scenario(n).truth])
-@pytest.mark.thin(5)
 def test_everyone_is_told_the_nominal_model(name: str) -> None:
     """Defence, attacker and channel go by the model of the scenario without `truth`; the vehicle does not, and drives with no collision."""
     import dataclasses

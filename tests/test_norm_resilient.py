@@ -184,7 +184,6 @@ def _updated(filter_, plan, model, r, accept=None, P=None):
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("gain", ["steady", "varying"])
 def test_sensors_that_are_not_accepted_leave_the_problem(gain, same_bits):
     """Any subset of the sensors, with correlated noise: the solution of the reduced problem; none at all is the prediction."""

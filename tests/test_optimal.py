@@ -65,7 +65,6 @@ def test_they_are_ceilings():
     [Rules(1, 10, 4, 10, 0), Rules(3, 9, 4, 10, 0), Rules(1, 10, 5, 2, 0), Rules(2, 10, 4, 3, 3), Rules(1, 10, 10, 1, 2), Rules(4, 4, 3, 9, 0)],
 )
 @pytest.mark.parametrize("states, a, seed", [(1, 1.2, 0), (1, 0.7, 0), (2, 1.0, 0), (2, 1.1, 2), (3, 0.95, 1)])
-@pytest.mark.thin(7)
 def test_the_schedule_is_as_good_as_the_best_of_all(states, a, seed, rules, objective):
     """Brute force over all 1024 schedules of ten steps that the threat model accepts."""
     filtering, P = system(a, states, seed), 2.0 * np.eye(states)
@@ -135,7 +134,6 @@ def test_played_losses_are_those_predicted(play):
 
 @pytest.mark.long
 @pytest.mark.parametrize("threat", [{"duration": 3}, {"duration": 2, "cooldown": 4}, {"end": 50, "cooldown": 3}, {"budget": None, "end": 20}])
-@pytest.mark.thin(4)
 def test_the_channel_accepts_every_loss(threat, play):
     """Whatever the threat model limits, nothing is refused and the schedule is used up as far as it may be."""
     place = dataclasses.replace(load_scenario("linear-dos-v0"), horizon=40).with_threat(**threat)

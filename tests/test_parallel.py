@@ -58,7 +58,6 @@ def test_pettingzoo_is_content(game, cycles):
     ("stop-and-go-v0", "windowed_chi2_kf", "steered:defence=windowed_chi2_kf"), ("radar-following-v0", "cra", "steered_cra"),
     ("platoon-braking-v0", "chi2_dkf:eta=22.8", "steered:defence=chi2_dkf,defence.eta=22.8"),
 ])  # fmt: skip
-@pytest.mark.thin(9)
 def test_knobs_that_nobody_turns_change_no_bit(place, plain, steered, short):
     """A steered defence at its own values gives the trace of the plain one, and at another setting another trace."""
     scene = short(place, horizon=120)
@@ -113,7 +112,6 @@ def test_rows_are_steered_on_their_own():
 
 @pytest.mark.long
 @pytest.mark.parametrize("interval", [1, 7, 20])
-@pytest.mark.thin(4)
 def test_masks_agree_with_what_the_channel_accepts(interval):
     """In random play no allowed action is refused throughout, and every other one than none is where its mask is 0."""
     threat = {"budget": 25, "duration": 6, "cooldown": 4, "onset": 20, "end": 200}

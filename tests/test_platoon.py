@@ -291,7 +291,6 @@ def test_sensors_need_a_told_noise():
 
 
 @pytest.mark.long
-@pytest.mark.thin(30)
 @pytest.mark.parametrize("name", PLATOONS)
 def test_every_scenario_has_a_manoeuvre_and_is_driven_without_a_collision(name):
     """The leader's speed changes by metres per second after the onset of attacks, and nobody collides without one."""

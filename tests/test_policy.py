@@ -109,7 +109,6 @@ def _same_trace(tmp_path: Path, spec: dict[str, Any], knowledge: str, scenario: 
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("action", ["mode", "increment"])
 def test_a_stochastic_policy_repeats_whatever_the_batch(tmp_path: Path, action: str) -> None:
     path = _policy(tmp_path, {"action": action})

@@ -231,7 +231,6 @@ def test_the_polynomial_is_that_of_least_squares(model):
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["hold_last", "autoregressive", "polynomial", "joint_rls"])
-@pytest.mark.thin(4)
 def test_every_predictor_stays_finite_and_composes(name, play):
     """Under readings of 1e6 and through 80 steps without any, in composed defences, each a batch of one as among others."""
     place = load_scenario("thesis-ch3-v0").with_threat(jam_range=(-1e6, 1e6), kinds=("dos_jam", "dropout"))

@@ -159,7 +159,6 @@ def test_ten_thousand_runs_behind_a_leader_stay_inside_of_the_tube():
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("noise", [None, "uniform"])
 def test_ten_thousand_runs_stay_inside_of_the_gaussian_tube_whatever_the_law_of_the_sensor(noise):
     """With a probability of 99 %; the deviation of the error is the one that the tube has."""

@@ -49,7 +49,6 @@ def test_the_pull_off_grows_by_its_rate_up_to_the_bound():
 
 @pytest.mark.long
 @pytest.mark.parametrize("attack", ["noise_jam", "echo_delay", "echo_pull_off", "radar_jam"])
-@pytest.mark.thin(4)
 def test_who_hops_radiates_only_after_a_step_with_a_probe(attack):
     """hop=true: silent in every step that follows a muted one, as the plain script is not; nothing is refused."""
     for text, silent in ((f"{attack}:start_step=5,hop=true", True), (f"{attack}:start_step=5", False)):
@@ -160,7 +159,6 @@ def test_a_program_over_the_air_needs_a_radar(tmp_path):
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["radar-following-v0", "radar-braking-v0", "radar-fast-attacker-v0"])
 @pytest.mark.parametrize("defence", ["none", "kf", "chi2_kf", "cra"])
-@pytest.mark.thin(5)
 def test_without_an_attack_everybody_arrives(name, defence):
     """200 episodes without a collision in front or behind and without a false alarm; standing, the car keeps its 5 m, the noise aside."""
     spec = Spec("defence", defence)

@@ -107,7 +107,6 @@ def test_the_likeliest_failure_is_the_nearest():
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("text", ["dropout:chance=0.1", "none"])
 def test_a_branch_is_the_same_until_it_leaves(text):
     """Keys that change at a step change nothing before it; the traced loop plays what the plain loop plays."""

@@ -154,7 +154,6 @@ def test_a_plant_that_begins_at_one_speed_is_refused():
 
 
 @pytest.mark.long
-@pytest.mark.thin(6)
 @pytest.mark.parametrize("name", ["road-following-v0", "road-string-v0", "road-us06-v0", "road-aeb-own-v0", "road-aeb-shared-v0"])
 def test_the_engine_plays_the_same_bits(name):
     for defence, attack in (("chi2_kf", "fdi:start_step=105,value=10"), ("none", "dropout:start_step=110")):
@@ -163,7 +162,6 @@ def test_the_engine_plays_the_same_bits(name):
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", ["road-following-v0", "road-string-v0"])
 def test_environments_begin_again_in_another_window_to_the_same_bits(name, tmp_path):
     as_plain({"scenario": name, "defence": "chi2_kf"}, 19, tmp_path)

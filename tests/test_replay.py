@@ -337,7 +337,6 @@ def test_a_class_is_looked_for_in_the_working_directory_only_when_named(folder, 
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("suffix", [".gif", ".webp"])
 def test_a_film_has_a_picture_of_every_step(pick, tmp_path, suffix):
     """A frame for the start and each step, as `draw` makes it; the last one is held."""

@@ -164,7 +164,6 @@ def test_the_page_has_a_choice_only_where_there_is_one(replays):
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", ["platoon", "network"])
 def test_a_film_of_many_agents(replays, tmp_path, name):
     """A picture of the start and every step."""

@@ -160,7 +160,6 @@ ROAD = {
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.page
 @pytest.mark.parametrize("name", ["radar", "highway"])
 def test_the_picture_says_what_the_plots_say(name, replays, tmp_path, browser):

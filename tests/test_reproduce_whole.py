@@ -91,7 +91,6 @@ def test_the_number_of_runs_is_no_verdict():
 
 @pytest.mark.long
 @pytest.mark.parametrize(("chapter", "expected"), [("ch5", {"5.3.2": "yes", "5.3.5": "no"}), ("ch6", {"6.5.1": "yes", "6.5.2": "yes", "6.5.5": "no"})])
-@pytest.mark.thin(2)
 def test_theorems_without_a_figure(chapter, expected, monkeypatch):
     """The linear estimators converge; the lemma's bound has lost a transpose, with which it is reached."""
     monkeypatch.setattr(whole_theorems, "RADII", (1.1,))

@@ -77,7 +77,6 @@ def test_raw_rewards(interval):
 
 
 @pytest.mark.long
-@pytest.mark.thin(3)
 @pytest.mark.parametrize(("scenario", "defence"), [("network-restless-v0", "dkf"), ("platoon-gusty-v0", "dkf"), ("stop-and-go-v0", "kf")])
 def test_the_rises_of_the_peak_add_up_to_the_largest_error(scenario, defence):
     """What `peak` pays for in an episode is `max_error` over error_scale, however many steps a decision lasts."""

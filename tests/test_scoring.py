@@ -381,7 +381,6 @@ def test_an_attack_more_never_makes_a_figure_better(seed) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("attacks", [1, 12])
 def test_the_interval_covers_the_critical_dose_of_a_known_curve(attacks) -> None:
     """Chances of 5 % at 20 steps and 25 % at 40 put it at 25, for one attack and for the worst of twelve equal ones, whose largest share is

@@ -172,7 +172,6 @@ def same(one, two):
      "fdi:value=3,targets=[leader_acceleration,predecessor_command]", "delay:age=5", "replay:window=20"],
 )  # fmt: skip
 @pytest.mark.parametrize("defence", ["kf", "dkf"])
-@pytest.mark.thin(14)
 def test_with_all_messages_authenticated_every_forged_cell_is_the_clean_one(attack, defence):
     clean, open_, sealed = played_in("none", defence), played_in(attack, defence), played_in(attack, defence, authenticated=FIELDS)
     assert same(sealed, clean) and sealed.refused.any() and not (sealed.kind != 0).any()
@@ -203,7 +202,6 @@ def test_other_wires_stay_open():
 
 @pytest.mark.long
 @pytest.mark.parametrize("attack", ["delay:age=2", "fdi:value=4", "dos_hold"])
-@pytest.mark.thin(3)
 def test_the_compiled_loop_seals_as_the_plain_one_does(attack):
     from .engines import loop_of
 

@@ -69,7 +69,6 @@ def test_too_many_subsets_are_refused(linear_model):
 
 
 @pytest.mark.long
-@pytest.mark.thin(3)
 @pytest.mark.parametrize("text", ["kf_bank:s=0", "kf_bank:s=0,sliding=true", "observer_bank:s=0"])
 def test_without_attacked_sensors_a_bank_is_the_steady_filter(text):
     """To the last bit, in the loop and under an attack."""

@@ -95,7 +95,6 @@ def test_the_sine_keeps_the_mean_speed_and_its_amplitude():
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("name", ["cacc", "ploeg_cacc"])
 def test_the_linear_loop_measures_what_the_model_says(name):
     """Gains of a simulated sweep on the thesis's linear platoon agree with the transfer function."""

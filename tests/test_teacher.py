@@ -138,7 +138,6 @@ def test_a_taught_run_resumes_to_the_same_policy(tmp_path: Path, brief: str) -> 
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("hidden", [(), (8,)])
 def test_a_search_begins_at_what_it_was_shown(tmp_path: Path, hidden: tuple[int, ...]) -> None:
     """The cross-entropy method's first mean decides as the script does, whatever the layers; its last layer has the scale 1."""

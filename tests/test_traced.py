@@ -204,7 +204,6 @@ def test_parameters_of_other_values_are_traced_once(monkeypatch):
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("names", [("car-following-noisy-v0", "car-following-late-v0"), ("car-following-lossy-v0", "car-following-noisy-v0")])
 def test_a_state_of_another_form_has_another_program(names, monkeypatch):
     """A perfect link has no state, and nothing but the state says so to the code of a step."""

@@ -252,7 +252,6 @@ def test_what_an_attacker_sees_and_may_do_is_as_in_the_plain_loop(scenario, defe
 
 
 @pytest.mark.long
-@pytest.mark.thin(4)
 @pytest.mark.parametrize(("scenario", "reward"), [("platoon-gusty-v0", "collision"), (THESIS, "error")])
 @pytest.mark.parametrize("action", ["mode", "continuous"])
 def test_a_single_environment_is_a_batch_of_one(action, scenario, reward):

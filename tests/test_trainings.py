@@ -39,7 +39,6 @@ def nobody(*_: object) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("workers", [1, 2])
 def test_one_that_fails_is_named_and_cuts_nobody_short(tmp_path: Path, workers: int) -> None:
     """Seed 0 of the first run cannot go on. What runs beside it comes to its end, nothing new begins, and the error says which it is."""
@@ -119,7 +118,6 @@ def test_processes_that_train_end_with_their_parent(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.thin(2)
 @pytest.mark.parametrize("gap", [0.0, 0.05])
 def test_two_interrupts_end_a_training_too(tmp_path: Path, gap: float) -> None:
     """Impatient users press twice: the second one cuts short the pool's end, and still nobody waits for workers that wait for work."""

@@ -85,7 +85,6 @@ def test_a_row_is_the_same_in_a_batch_of_4096() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.thin(6)
 @pytest.mark.parametrize(("suite", "scenario", "dose", "defence", "attack", "seeds"), [
     ("car-following-v0", "car-following-noisy-v0", 10, "chi2_kf", "stealth:trigger=near,threshold=40", 60),
     pytest.param("car-following-v0", "car-following-noisy-v0", 10, "chi2_kf", "stealth:trigger=near,threshold=40", 300, marks=pytest.mark.long),
