@@ -52,7 +52,7 @@ many.step(many.action_space.sample())
 assert many.engine == "traced", many.engine_why
 heavy = [name for name in ("torch", "stable_baselines3", "cvxpy", "matplotlib.pyplot") if name in sys.modules]
 assert not heavy and find_spec("torch") is None, f"the light install brings or loads {heavy or 'torch'}"
-assert {"LICENSE", "NOTICE"} <= {path.name for path in files("tailgate") or () if "licenses" in path.parts}
+assert {"LICENSE", "LICENSE-Apache-2.0", "NOTICE"} <= {path.name for path in files("tailgate") or () if "licenses" in path.parts}
 P
 
 for python in "$@"; do
