@@ -117,7 +117,7 @@ def test_a_stochastic_policy_repeats_whatever_the_batch(tmp_path: Path, action: 
     alone = [rollout(loop, PolicyAttack(path, stochastic=True), draws.keys("report", [s])).trace_hash(0) for s in SEEDS[:4]]
     assert [together.trace_hash(i) for i in range(4)] == alone
     calm = rollout(loop, PolicyAttack(path), draws.keys("report", SEEDS))
-    assert together.trace_hash(0) != calm.trace_hash(0)
+    assert any(together.trace_hash(i) != calm.trace_hash(i) for i in range(len(SEEDS)))
 
 
 def test_what_is_saved_is_what_is_loaded(tmp_path: Path) -> None:

@@ -132,7 +132,7 @@ class _Log(BaseModel):
     format: Literal["tailgate-log-1"]
     files: list[_File]
     scenarios: Annotated[dict[str, _Place], Field(min_length=1)]
-    defences: list[str]
+    defences: Annotated[list[str], Field(min_length=1)]
 
 
 def from_log(folder: Path, scenarios: Sequence[str] | None, settings: Settings, progress: Progress | None = None) -> Sheet:
