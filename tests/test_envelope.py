@@ -299,7 +299,7 @@ def test_a_log_and_its_scenario_teach_the_same(tmp_path):
     (folder / "schema.json").write_text(json.dumps(held))
     with pytest.raises(InputError, match=r"log .*files.0.path.*elsewhere"):
         from_log(folder, None, LOOSE)
-    (folder / "schema.json").write_text(json.dumps(held | {"defences": []}))
+    (folder / "schema.json").write_text(json.dumps(held | {"defences": [], "files": []}))
     with pytest.raises(InputError, match="defences"):
         from_log(folder, None, LOOSE)
     (folder / "schema.json").write_text("{}")
