@@ -101,6 +101,14 @@ def test_settling_and_the_end_of_a_piece_do_not_count():
     assert row["alarm_share"] == 1.0 and row["hours"] == pytest.approx(24.9 / 3600.0) and row["alarms"] == 1  # on when they begin to count
 
 
+def test_an_alarm_that_was_on_before_the_attack_is_told(capsys):
+    assert main(["detect-log", "asta-braking", "--vehicle", "5", "--defence", "always_alarm", "--attack", "fdi:start_step=150,value=6", "--json"]) == 0
+    (row,) = (one for one in json.loads(capsys.readouterr().out) if one["attack"] != "none")
+    assert row["alarmed_before"] == row["detected"] == row["attacked"] > 0
+    assert main(["detect-log", "asta-braking", "--vehicle", "5", "--defence", "always_alarm", "--attack", "fdi:start_step=150,value=6"]) == 0
+    assert f"{row['attacked']} on" in " ".join(capsys.readouterr().out.split())
+
+
 def test_the_threshold_of_a_wanted_rate_on_the_synthetic_road():
     found = at_hours("chi2_kf", 0.1, Noise(), 0.02, onsets=60)
     assert found["wanted_hours"] == 0.02 and 5.0 < found["threshold"] < 40.0

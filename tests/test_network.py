@@ -21,7 +21,7 @@ from tailgate.evaluation.attack_free import Bench, count_onsets, most_at_once
 from tailgate.evaluation.rows import read_rows
 from tailgate.evaluation.summary import summarise
 from tailgate.play.metrics import measure
-from tailgate.play.trace import rollout
+from tailgate.play.trace import WORTH, rollout, worth_tracing
 
 NETWORKS = [name for name in list_scenarios() if isinstance(load_scenario(name).plant, SensorNetwork) and load_scenario(name).plant.agents > 1]
 NONE, STILL = make("controller", "none"), make("manoeuvre", "constant", value=0.0)
@@ -357,3 +357,12 @@ def test_close_eigenvalues_are_told_apart():
         )
         assert blind(model) == [0]
         assert blind(dataclasses.replace(model, C=np.array([[[1.0, 1.0]]]))) == []
+
+
+def test_of_a_network_fewer_episodes_are_worth_a_traced_loop():
+    """Three agents count as one car."""
+    for name, agents in (("thesis-ch5-v0", 10), ("thesis-ch4-v0", 1)):
+        loop = load_scenario(name).loop(make("defence", "kf"))
+        assert loop.model.agents == agents
+        enough = int(np.ceil(WORTH / (loop.horizon * max(1.0, agents / 3.0))))
+        assert worth_tracing(loop, enough) and not worth_tracing(loop, enough - 1)

@@ -47,7 +47,7 @@ def test_an_address_that_another_car_gets_is_another_track(tmp_path):
     can = logs.comma(tmp_path) / "processed_log" / "CAN" / "radar"
     values = np.load(can / "value")
     values[200:, 0] += 40.0
-    values[200, 6] = 1.0
+    values[200:203, 6] = 1.0
     logs.save(can / "value", values)
     (found,) = read(str(tmp_path))
     assert found.samples == 400 and found.segments[0].begin == pytest.approx(20.0) and np.abs(found.segments[0].gap - 40.0 - logs.GAP[200:]).max() < 2e-3

@@ -62,7 +62,7 @@ def pick(rows):
 
 
 def test_every_row_is_played_again_to_the_last_bit(rows):
-    """A batch of one gives the hash and every figure of the batch that made the row, also under a scenario of one's own. One row in three is played."""
+    """A batch of one gives the hash and every figure of the row, also in a scenario from a file. One row in three is played."""
     assert len(rows) == 24 and len({row["trace_hash"] for row in rows}) > 12
     for row in rows[::3]:
         replay = play(row)

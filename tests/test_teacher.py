@@ -82,11 +82,11 @@ def test_a_long_demonstration_is_played_by_a_traced_program_with_the_same_bits(b
     seat = Seat.make(**(ENVIRONMENT | {"scenario": brief, "interval": 1, "frames": 2}))
     scripts = [attack(f"fdi_then_jam:start_step={step},inject=10") for step in (30, 50)]
     traces: list[int] = []
-    monkeypatch.setattr(teacher, "LONG", 1)
+    monkeypatch.setattr("tailgate.play.trace.LONG", 1)
     monkeypatch.setattr(teacher, "traced", lambda *arguments: traces.append(1) or traced(*arguments))
     found = [demonstrate(seat, script, 0, episodes=7) for script in scripts]
     assert len(traces) == 1
-    monkeypatch.setattr(teacher, "LONG", 10**9)
+    monkeypatch.setattr("tailgate.play.trace.LONG", 10**9)
     plain = [demonstrate(seat, script, 0, episodes=7) for script in scripts]
     assert [[part.tobytes() for part in one] for one in found] == [[part.tobytes() for part in one] for one in plain]
     assert found[0].observation.shape[1] == 2 * len(seat.observation.columns) and not np.array_equal(found[0].action, found[1].action)
@@ -101,7 +101,7 @@ def test_a_defence_that_fails_ends_a_traced_demonstration_with_the_plain_error(m
     seat = Seat.make(**(ENVIRONMENT | {"interval": 1, "defence": Lost()}))
     with pytest.raises(InputError) as found:
         demonstrate(seat, attack(SCRIPT), 0, episodes=3)
-    monkeypatch.setattr(teacher, "LONG", 10**9)
+    monkeypatch.setattr("tailgate.play.trace.LONG", 10**9)
     with pytest.raises(InputError) as wanted:
         demonstrate(seat, attack(SCRIPT), 0, episodes=3)
     assert str(found.value) == str(wanted.value)

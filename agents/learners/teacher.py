@@ -21,7 +21,7 @@ from tailgate.engine.tracing import traced
 from tailgate.envs.gym.actions import ActionCodec
 from tailgate.envs.gym.attacker_mdp import Seat, Tally
 from tailgate.envs.gym.observations import ObservationCodec
-from tailgate.play.trace import LONG, WORTH
+from tailgate.play.trace import worth_tracing
 
 FIRST = SEED_STRIDE // 2  # number of the first demonstration among the episodes of a training seed
 
@@ -123,7 +123,7 @@ def demonstrate(seat: Seat, attack: Attack, seed: int, episodes: int) -> Demonst
 
 def _played(seat: Seat, attack: Attack, plan: object, keys: Keys) -> dict[str, Array]:
     """Return the results (K, B, ...) of all decisions, by a traced program where it pays: decisions of many steps take long to compile."""
-    if seat.action.spec.interval == 1 and (seat.loop.horizon >= LONG or seat.loop.horizon * len(keys.key) >= WORTH):
+    if seat.action.spec.interval == 1 and worth_tracing(seat.loop, len(keys.key)):
         made = _made.proved(
             (seat, attack, plan), lambda: decided(seat, attack, plan, begun(seat, attack, plan, _ONE)), lambda: Showing(seat, attack, plan),
             lambda found, values: found.of(seat, attack, plan, values), _difference,

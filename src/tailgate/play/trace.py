@@ -132,6 +132,11 @@ class Recorder:
         return Trace(loop.model, loop.horizon, self.length, signals, self.first, loop.controller.desired_gap)
 
 
+def worth_tracing(loop: Loop, episodes: int) -> bool:
+    """Return True if this many episodes justify a traced loop. Agents take longer to trace and much longer to play: three count as one."""
+    return loop.horizon >= LONG or episodes * loop.horizon * max(1.0, loop.model.agents / 3.0) >= WORTH
+
+
 def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True, plain: bool = False) -> Trace:
     """Play one episode per key and return the trace.
 
@@ -142,7 +147,7 @@ def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True, p
     if not plain and isinstance(watch := loop.defence, Watched):
         seen = rollout(loop.bare, attack, keys, terminate=terminate)
         return dataclasses.replace(seen, signals=seen.signals | {"alarm": watch.alarms(seen.score)})
-    if not plain and (play := _player(loop, attack, len(keys.key) * loop.horizon)) is not None:
+    if not plain and (play := _player(loop, attack, len(keys.key))) is not None:
         return Trace(loop.model, loop.horizon, *play(keys, terminate), loop.controller.desired_gap)
     state = loop.start(keys)
     plan = attack.prepare(loop.brief)
@@ -157,18 +162,17 @@ def rollout(loop: Loop, attack: Attack, keys: Keys, *, terminate: bool = True, p
     return recorder.trace()
 
 
-def _player(loop: Loop, attack: Attack, steps: int) -> Player | None:
-    """Return a function that plays this many steps faster than the plain loop, or None."""
+def _player(loop: Loop, attack: Attack, episodes: int) -> Player | None:
+    """Return a function that plays this many episodes faster than the plain loop, or None."""
     from tailgate.engine.agreement import Untraced
     from tailgate.engine.cards import DeviceError, device
     from tailgate.play.commanded import commanded
     from tailgate.play.rollouts import rollout_of
 
     here = device()
-    if (steps >= MANY or here != "cpu") and not isinstance(whole := rollout_of(loop, attack), Untraced):
+    if (episodes * loop.horizon >= MANY or here != "cpu") and not isinstance(whole := rollout_of(loop, attack), Untraced):
         return whole.play
-    # agents take longer to trace, and much longer to play
-    if max(steps, steps * loop.model.agents / 3) >= WORTH or loop.horizon >= LONG or here != "cpu":
+    if worth_tracing(loop, episodes) or here != "cpu":
         if not isinstance(program := commanded(loop), Untraced):
             return partial(program.play, attack)
         if here != "cpu":

@@ -248,10 +248,11 @@ def _comma(path: Path, choice: Choice) -> list[Raw]:
     addresses = values[:, 5].astype(np.int64)
     if choice.vehicle is not None and choice.vehicle not in map(str, set(addresses.tolist())):
         raise unknown("comma2k19 file: --vehicle", choice.vehicle, map(str, sorted(set(addresses.tolist()))))
-    begun = Counter[int]()  # tracks of each address: the radar gives one to another car where it says that the track is new
+    begun, fresh = Counter[int](), dict[int, bool]()  # of each address: another car gets it where the radar says that the track is new
     tracks: list[tuple[int, int]] = []
-    for address, new in zip(addresses.tolist(), values[:, 6] != 0.0, strict=True):
-        begun[address] += int(new)
+    for address, new in zip(addresses.tolist(), (values[:, 6] != 0.0).tolist(), strict=True):
+        begun[address] += new and not fresh.get(address, False)
+        fresh[address] = new
         tracks.append((address, begun[address]))
     long = Counter(track for track in tracks if choice.vehicle in (None, str(track[0])))
     chosen = max(long, key=lambda track: (long[track], -track[0], -track[1]))
