@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import urllib.request
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,6 +32,7 @@ ROOT = Path(__file__).parents[1]
 PAGE, RECORD = ROOT / "docs/ecosystem.md", ROOT / "benchmarks/results/ecosystem.json"
 LIMIT = 600  # seconds for a snippet
 OWN = str(ROOT)
+CLEANRL = "https://raw.githubusercontent.com/vwxyzjn/cleanrl/fe8d8a03c41a7ef5b523e2e354bd01c363e786bb/cleanrl"
 
 
 class Library(NamedTuple):
@@ -40,13 +42,14 @@ class Library(NamedTuple):
     named: tuple[str, ...]
     extra: bool = False
     torch: bool = True
+    file: str = ""  # a file that the snippet needs, by its address; one that DIR holds already is used again
 
 
 LIBRARIES = {
     "Gymnasium": Library((OWN,), (), True, False),
     "Stable-Baselines3": Library((f"{OWN}[train]",), ("stable-baselines3", "torch"), True),
     "rl-zoo3": Library((OWN, "rl_zoo3>=2.9"), ("rl_zoo3", "stable-baselines3", "torch")),
-    "CleanRL": Library((OWN,), ("torch",), True),
+    "CleanRL": Library((OWN, "tyro", "tensorboard"), ("torch", "tyro", "tensorboard"), file=f"{CLEANRL}/ppo.py"),
     "TorchRL": Library((f"{OWN}[torchrl]",), ("torchrl", "tensordict", "torch"), True),
     "RLlib": Library((OWN, "ray[rllib]>=2.60"), ("ray", "torch")),
     "PettingZoo": Library((f"{OWN}[game]",), ("pettingzoo",), True, False),
@@ -82,6 +85,15 @@ def environment(library: Library, folder: Path) -> str:
     return ""
 
 
+def held_file(address: str, folder: Path) -> Path:
+    """Return a file of a library in a folder; fetch it if it is not there."""
+    path = folder / address.rpartition("/")[2]
+    if not path.exists():
+        with urllib.request.urlopen(address, timeout=60) as found:
+            write_atomic(path, found.read())
+    return path
+
+
 def last(lines: list[str]) -> str:
     """Return the last line with a word in it."""
     return next((line.strip() for line in reversed(lines) if re.search(r"\w", line)), "no message")
@@ -105,6 +117,8 @@ def tried(name: str, scratch: Path) -> dict[str, Any]:
     held = versions(python, [*library.named, "gymnasium", "numpy"])
     entry |= {"python": held.pop("python"), "versions": held}
     with tempfile.TemporaryDirectory() as place:
+        if library.file:
+            shutil.copy(held_file(library.file, folder), place)
         (Path(place) / "snippet.py").write_text(snippet(name, PAGE.read_text(encoding="utf-8")), encoding="utf-8")
         alone = os.environ | {"MINARI_DATASETS_PATH": place, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
         began = time.perf_counter()
