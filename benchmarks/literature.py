@@ -5,7 +5,7 @@
 Each method has four parts, each in its own file. Parts that exist are not played again:
 
 * calibrated: the threshold for one false alarm in HOURS of clean driving, and the clean errors
-* compromised: the position error under a bias on 0, 1, ..., 7 of the sensors, the most accurate first
+* compromised: the position error under a bias, and under a ramp, on 0, 1, ..., 7 of the sensors, the most accurate first
 * listed: a bias of -30 on two sensors for 50 steps: collisions, and if the alarm sounds
 * searched: what scripts and programs of the standard ensemble, budget quick, do where two sensors can be reached. With --no-search only
   what exists is shown
@@ -42,6 +42,8 @@ from tailgate.play.trace import Trace, rollout
 
 METHODS = {
     "kf": "kf",
+    "rkf": "rkf",
+    "chi2_kf": "chi2_kf",
     "chi2_kf_sparse": "chi2_kf_sparse",
     "bernoulli": "bernoulli",
     "kf_bank": "kf_bank:s=2",
@@ -58,7 +60,8 @@ SLOW = ("l0_robust",)  # is not traced: a search against it would take hours
 ORDER = ("lidar", "radar_long", "wheels", "radar_short", "v2v", "gnss", "camera")  # the most accurate first
 SCENARIO, SUITE, DOSE = "redundant-two-v0", "redundant-v0", 50
 HOURS, ONSETS, EPISODES = 0.1, 60, 100
-SEEDS, HORIZON, FIRST, LENGTH, BIAS = 20, 300, 100, 100, -10.0
+SEEDS, HORIZON, FIRST, LENGTH = 20, 300, 100, 100
+LIES = {"bias": "fdi:value=-10", "ramp": "fdi_ramp:rate=-0.1"}  # the ramp reaches -10 at its end
 BUDGET, MEMBERS = "quick", ("scripts", "programs")  # all members take a quarter of an hour for each method
 LISTED = "fdi:trigger=near,threshold=40,value=-30"
 
@@ -102,9 +105,11 @@ def compromised(text: str) -> dict[str, Any]:
     place, rows = dataclasses.replace(load_scenario(SCENARIO), horizon=HORIZON), []
     for count in range(len(ORDER) + 1):
         here = place.with_threat(targets=ORDER[:count] or ("lidar",), budget=None)
-        against = f"fdi:start_step={FIRST},length={LENGTH},value={BIAS}" if count else "none"
-        rows.append({"sensors": count, "rmse": quantiles(errors(played(here, text, against, SEEDS, False), FIRST, FIRST + LENGTH))})
-    return {"defence": text, "order": list(ORDER), "bias": BIAS, "rows": rows}
+        for lie, attack in LIES.items():
+            against = f"{attack},start_step={FIRST},length={LENGTH}" if count else "none"
+            off = quantiles(errors(played(here, text, against, SEEDS, False), FIRST, FIRST + LENGTH))
+            rows.append({"sensors": count, "lie": lie, "rmse": off})
+    return {"defence": text, "order": list(ORDER), "lies": LIES, "rows": rows}
 
 
 def listed(text: str) -> dict[str, Any]:
@@ -147,22 +152,19 @@ def part(out: Path, name: str, method: str, make: Callable[[], dict[str, Any]] |
 
 def figure(out: Path, held: dict[str, dict[str, Any]]) -> None:
     """Draw the error over the number of compromised sensors, and what the ensemble damages."""
-    found = {name: parts["searched"] for name, parts in held.items() if parts["searched"]}
-    shown, axes = canvas(10.0, 4.6, 1, 2, width_ratios=[1.4, 1.0]) if found else canvas(8.0, 4.6)
-    ax = axes[0, 0]
-    for i, (name, parts) in enumerate(held.items()):
-        if parts["compromised"] is None:
-            continue
-        middle = [row["rmse"][1] for row in parts["compromised"]["rows"]]
-        line = f"{'osD^v<>PX*h'[i % 11]}{'-' if i < 10 else ':'}"
-        ax.plot(range(len(middle)), middle, line, color=f"C{i % 10}", markersize=4, label=name)
-    ax.axvspan(2.5, 7.2, color="0.92", zorder=0)
-    ax.set(yscale="log", xlabel="sensors with a bias of -10, of 7", ylabel="position RMSE during the bias [m], median")
-    ax.set_title("grey: more than the two that can be corrected", fontsize=10)
-    ax.grid(alpha=0.3)
-    if found:
-        _found(axes[0, 1], found)
-    shown.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", fontsize=8, ncols=6)
+    shown, axes = canvas(13.0, 4.8, 1, 3, width_ratios=[1.2, 1.2, 1.0])
+    for ax, (lie, attack) in zip(axes[0], LIES.items(), strict=False):
+        for i, (name, parts) in enumerate(held.items()):
+            if parts["compromised"] is not None:
+                middle = [row["rmse"][1] for row in parts["compromised"]["rows"] if row["lie"] == lie]
+                line = f"{'osD^v<>PX*hp8d'[i % 14]}{'-' if i < 10 else ':'}"
+                ax.plot(range(len(middle)), middle, line, color=f"C{i % 10}", markersize=4, label=name)
+        ax.axvspan(2.5, 7.2, color="0.92", zorder=0)
+        ax.set(yscale="log", xlabel=f"sensors of 7 with {attack}", ylabel="position RMSE during the attack [m], median")
+        ax.set_title(f"a {lie}; grey: more than the two that can be corrected", fontsize=9)
+        ax.grid(alpha=0.3)
+    _found(axes[0, 2], {name: parts["searched"] for name, parts in held.items() if parts["searched"]})
+    shown.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", fontsize=8, ncols=7)
     write_atomic(out / "literature.png", png(shown))
 
 
@@ -213,7 +215,7 @@ def main() -> int:
     held: dict[str, dict[str, Any]] = {name: {} for name in names}
     makers: dict[str, Callable[[str], dict[str, Any]]] = {
         "calibrated": lambda name: calibrated(METHODS[name]),
-        "compromised": lambda name: compromised(METHODS[name]),
+        "compromised": lambda name: compromised(held[name]["calibrated"]["defence"]),
         "listed": lambda name: listed(held[name]["calibrated"]["defence"]),
         "searched": lambda name: searched(held[name]["calibrated"]["defence"], options.scratch / name.replace(", ", "-")),
     }

@@ -11,7 +11,8 @@ from tailgate.base.errors import InputError
 from tailgate.core.draws import keys
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
-from tailgate.estimators.sparse_attacks.kf_bank import KalmanBank
+from tailgate.estimators.sparse_attacks.bank import expected, statistic
+from tailgate.estimators.sparse_attacks.kf_bank import KalmanBank, block_threshold, quantile, tail_of
 from tailgate.estimators.sparse_attacks.l0_robust import bounds_of
 from tailgate.estimators.sparse_attacks.minimax import Minimax
 from tailgate.estimators.sparse_attacks.observer_bank import ObserverBank
@@ -178,13 +179,47 @@ def test_the_window_bank_has_the_covariance_of_least_squares(linear_model):
 
 @pytest.mark.parametrize("text", [text for text in WINDOWED if text not in ("minimax", "bernoulli")])
 def test_silent_sensors_are_no_zeros(linear_model, text):
-    """Two of five sensors fall silent; the state is 1000, and stays so."""
+    """Two of five sensors fall silent, then all of them; the state is 1000, and stays so."""
     model = linear_model([[1.0]], np.ones((5, 1)), [[1e-6]], 1e-4 * np.eye(5))
-    ys, valid = np.full((14, 1, 5), 1000.0), np.ones((14, 1, 5), bool)
-    valid[8:, :, 2:4] = False
+    ys, valid = np.full((20, 1, 5), 1000.0), np.ones((20, 1, 5), bool)
+    valid[8:, :, 2:4] = valid[12:] = False
     ys[~valid] = 0.0
     _, out = play_readings(Spec("defence", f"{text}{',' if ':' in text else ':'}s=1").make(), model, ys, np.full((1, 1, 1), 1000.0), valid)
     assert all(estimate.x[0, 0, 0] == pytest.approx(1000.0, abs=0.1) for _, estimate in out[7:])
+
+
+@pytest.mark.parametrize("rate", [0.3, 0.7])
+def test_lost_readings_leave_the_filter_of_the_others(linear_model, rate):
+    """Each reading is lost with a probability: the banks without attacked sensors, and minimax, are the steady filter; D is the marginal's."""
+    model = dense(linear_model, RNG, n=2, q=4, Q=0.5, R=0.01)
+    _, ys = simulated(model, 40, 16, RNG)
+    valid = RNG.random(ys.shape) > rate
+    _, known = play_readings(tailgate.make_defence("kf", gain="steady"), model, ys, valid=valid)
+    for text in ("kf_bank:s=0,block=1", "observer_bank:s=0", "minimax:attacked=0"):
+        _, out = play_readings(Spec("defence", text).make(), model, ys, valid=valid)
+        for (_, ours), (_, theirs) in zip(out, known, strict=True):
+            np.testing.assert_allclose(ours.x, theirs.x, rtol=1e-9, atol=1e-9, err_msg=text)
+    bank = KalmanBank(s=1, block=1).prepare(model).bank
+    z, some = RNG.normal(size=(16, 1, 4, 4)), valid[:16].reshape(16, -1, 4)[:, :1]
+    g = statistic(bank, expected(bank, np.where(some[..., None], z, 0.0), some))
+    for k, keep in enumerate(bank.keep):
+        S = model.C[0] @ bank.before[0, k] @ model.C[0].T + model.R[0]
+        for b in range(16):
+            O = keep & some[b, 0]
+            assert g[b, 0, k] == pytest.approx(z[b, 0, O, k] @ np.linalg.inv(S[np.ix_(O, O)]) @ z[b, 0, O, k], rel=1e-8, abs=1e-12)
+
+
+def test_a_block_with_lost_readings_alarms_as_seldom(linear_model):
+    """The quantile is scipy's to a hundredth, and a settled bank that loses half of its readings alarms in about alpha of the blocks."""
+    for degrees in (3, 10, 50):
+        h = block_threshold(1e-3, 1, 1, degrees)
+        count = np.arange(1.0, degrees + 1)
+        np.testing.assert_allclose(quantile(count, tail_of(h, degrees)), stats.chi2.isf(1e-3, count), rtol=0.03)
+    model = linear_model([[1.0]], np.ones((4, 1)), [[1e-6]], np.eye(4))
+    _, ys = simulated(model, 400, 400, RNG)
+    valid = RNG.random(ys.shape) > 0.5
+    _, out = play_readings(KalmanBank(s=0, alpha=0.02), model, ys, valid=valid)
+    assert 0.012 < np.mean([out[k][1].alarm for k in range(99, 400, 10)]) < 0.03
 
 
 @pytest.mark.long

@@ -2,8 +2,11 @@
 
     x-_K = A x_K + B u + c          z_K = y - C x-_K          x_K = x-_K + G_K z_K
 
-G_K is the steady gain of the sensors in K, with zeros for the others. The bank is the last axis: x (B, N, n, K), z (B, N, q, K). A reading
-that is missing has z = 0: the others keep their gains.
+G_K is the steady gain of the sensors in K, with zeros for the others. The bank is the last axis: x (B, N, n, K), z (B, N, q, K).
+
+A reading that is missing gets the z_M that the others let expect, z_M = -(W_MM)^-1 W_MO z_O with W = S^-1. Then G_K z_K is the
+correction that the others make alone at the same P-, and z_K' W z_K is their own z_O' (S_OO)^-1 z_O. As in the steady filter, P- and S do
+not widen.
 """
 
 import dataclasses
@@ -59,7 +62,34 @@ def bank_step(plan: BankPlan, x: Array, received: Received, known_u: Array) -> t
     """Return x (B, N, n, K) and z (B, N, q, K) after a step of every filter."""
     x = num.matmul(plan.A, x) + num.matvec(plan.B, known_u)[..., None] + plan.c[:, None]
     z = np.where(received.valid[..., None], received.y[..., None] - num.matmul(plan.C, x), 0.0)
+    z = expected(plan, z, received.valid)
     return x + summed(plan.gain, z), z
+
+
+def expected(plan: BankPlan, z: Array, arrived: Array) -> Array:
+    """Return z (B, N, q, K) with what the readings that arrived (B, N, q) let expect of the others; by conjugate gradients."""
+    missing = ~arrived[..., None]
+
+    def step(z: Array, r: Array, p: Array, left: Array) -> tuple[Array, list[Array]]:
+        first = left < 0.0
+        pull = np.where(missing, summed(plan.weight, np.where(first[..., None, :], z, p)), 0.0)
+        curve = _dot(p, pull)
+        move = np.where(curve > 0.0, left / np.where(curve > 0.0, curve, 1.0), 0.0)[..., None, :]
+        r = np.where(first[..., None, :], -pull, r - move * pull)
+        square = _dot(r, r)
+        turn = np.where(left > 0.0, square / np.where(left > 0.0, left, 1.0), 0.0)[..., None, :]
+        return np.asarray((square > 0.0).any(axis=-1)), [z + move * p, r, r + turn * p, square]
+
+    state = [z, np.zeros_like(z), np.zeros_like(z), np.full_like(z[..., 0, :], -1.0)]
+    return num.until(step, state, np.asarray(missing.any(axis=(-2, -1))), 2 * z.shape[-2])[0]
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Return sum_i a_i b_i (B, N, K) for a, b (B, N, q, K), in ascending order."""
+    out = a[..., 0, :] * b[..., 0, :]
+    for i in range(1, a.shape[-2]):
+        out = out + a[..., i, :] * b[..., i, :]
+    return np.asarray(out)
 
 
 def summed(M: Array, z: Array) -> Array:
@@ -72,8 +102,4 @@ def summed(M: Array, z: Array) -> Array:
 
 def statistic(plan: BankPlan, z: Array) -> Array:
     """Return z_K' S_K^-1 z_K (B, N, K)."""
-    pull = summed(plan.weight, z)
-    out = pull[..., 0, :] * z[..., 0, :]
-    for i in range(1, z.shape[-2]):
-        out = out + pull[..., i, :] * z[..., i, :]
-    return np.asarray(out)
+    return _dot(summed(plan.weight, z), z)

@@ -4,8 +4,9 @@ For each subset K of q - s sensors a steady Kalman filter runs (bank.py). With i
 
     D_K = sum over a block of N steps of z_K' S_K^-1 z_K,       K is accepted if D_K <= h,       h = chi2.isf(alpha / number of K, N |K|)
 
-D_K is chi-square with N |K| degrees of freedom where no sensor in K is attacked. The paper compares each diagonal entry of the residues'
-sample covariance with its expectation plus eta; this test is exact instead, and joint.
+D_K is chi-square with N |K| degrees of freedom where no sensor in K is attacked, all readings arrive and the filter has settled. A block
+with fewer readings has fewer degrees: D_K is then scaled to h, by the quantiles of Wilson and Hilferty (1931). The paper compares each
+diagonal entry of the residues' sample covariance with its expectation plus eta; this test is joint instead.
 """
 
 from dataclasses import dataclass
@@ -34,12 +35,15 @@ ATTACKED = "sensors that may be attacked at the same time"
 class KfBankPlan(NamedTuple):
     bank: BankPlan
     threshold: float  # h
+    degrees: int  # N |K|
+    tail: float  # the standard normal quantile at which `quantile` gives h
     first: int  # the filter that is believed before a block has ended
 
 
 class KfBankState(NamedTuple):
     x: Array  # (B, N, n, K)
     sums: Array  # (B, N, K, L) of the block so far, L = 1; sliding: over the last 1, 2, ..., N - 1 steps
+    counts: Array  # (B, N, K, L) likewise, of the readings that arrived
     steps: Array  # (B, N) int64: steps of the block so far
     chosen: Array  # (B, N) int64
     score: Array  # (B, N) of the last block
@@ -51,6 +55,20 @@ def block_threshold(alpha: float, filters: int, block: int, sensors: int) -> flo
     from scipy import special  # not loaded where no threshold is made
 
     return float(special.chdtri(block * sensors, alpha / filters))
+
+
+def quantile(degrees: Array, tail: float) -> Array:
+    """Return the chi-square quantile of Wilson and Hilferty for degrees > 0, where the standard normal one is `tail`."""
+    share = 2.0 / (9.0 * degrees)
+    root = np.maximum(1.0 - share + tail * np.sqrt(share), 0.0)
+    return np.asarray(degrees * (root * root * root))
+
+
+def tail_of(h: float, degrees: int) -> float:
+    """Return the standard normal quantile at which `quantile` gives h."""
+    share = 2.0 / (9.0 * degrees)
+    root = num.exp(num.log(np.array([h / degrees])) / 3.0)[0]
+    return float((root - 1.0 + share) / np.sqrt(share))
 
 
 @register("defence", "kf_bank", reference=PAPER)
@@ -72,22 +90,27 @@ class KalmanBank:
         require(model, self.s, "defence kf_bank")
         keep = without(len(model.sensors), self.s)
         bank = bank_plan(model, keep)
-        h = block_threshold(self.alpha, len(keep), self.block, int(np.count_nonzero(keep[0]))) if self.threshold is None else self.threshold
-        return KfBankPlan(bank, h, int(np.argmin(np.max(bank.after.trace(axis1=-2, axis2=-1), axis=0))))
+        kept, first = int(np.count_nonzero(keep[0])), int(np.argmin(np.max(bank.after.trace(axis1=-2, axis2=-1), axis=0)))
+        h = block_threshold(self.alpha, len(keep), self.block, kept) if self.threshold is None else self.threshold
+        return KfBankPlan(bank, h, self.block * kept, tail_of(h, self.block * kept), first)
 
     def start(self, plan: KfBankPlan, prior: Prior) -> KfBankState:
         shape = prior.mean.shape[:2]
         sums = num.zeros((*shape, len(plan.bank.keep), self.block - 1 if self.sliding else 1))
         chosen = num.full(shape, plan.first, np.int64)
-        return KfBankState(
-            bank_start(plan.bank, prior.mean), sums, num.zeros(shape, np.int64), chosen, num.zeros(shape), num.zeros(shape, bool)
-        )
+        x, steps = bank_start(plan.bank, prior.mean), num.zeros(shape, np.int64)
+        return KfBankState(x, sums, sums.copy(), steps, chosen, num.zeros(shape), num.zeros(shape, bool))
 
     def step(
         self, plan: KfBankPlan, state: KfBankState, received: Received, known_u: Array, draws: Draws
     ) -> tuple[KfBankState, Estimate]:
         x, z = bank_step(plan.bank, state.x, received, known_u)
-        total, sums, steps, judged = self._blocks(state, statistic(plan.bank, z))
+        arrived = num.matvec(plan.bank.keep.astype(np.float64), received.valid.astype(np.float64))
+        steps = np.minimum(state.steps + 1, self.block) if self.sliding else state.steps + 1
+        judged = steps >= self.block
+        total, sums = self._summed(state.sums, statistic(plan.bank, z), judged)
+        count, counts = self._summed(state.counts, arrived, judged)
+        total = self._scaled(plan, total, count)
         best = np.argmin(total, axis=-1)
         if self.choice == "first":
             passed = total <= plan.threshold
@@ -100,20 +123,25 @@ class KalmanBank:
         estimate = Estimate(
             num.pick(x, chosen[..., None]), score, alarm, num.full(score.shape, Mode.NORMAL, np.int8), np.ones_like(alarm)
         )
-        return KfBankState(x, sums, steps, chosen, score, alarm), estimate
+        steps = steps if self.sliding else np.where(judged, 0, steps)
+        return KfBankState(x, sums, counts, steps, chosen, score, alarm), estimate
 
-    def _blocks(self, state: KfBankState, g: Array) -> tuple[Array, Array, Array, Array]:
-        """Return the sums (B, N, K) to judge, the next sums and steps, and where (B, N) a block ends."""
-        steps = np.minimum(state.steps + 1, self.block) if self.sliding else state.steps + 1
-        judged = steps >= self.block
+    def _summed(self, held: Array, new: Array, judged: Array) -> tuple[Array, Array]:
+        """Return the sums (B, N, K) over a block that ends here, and the next ones (B, N, K, L)."""
+        if not held.shape[-1]:
+            return new, held
+        total = held[..., -1] + new
         if not self.sliding:
-            total = state.sums[..., 0] + g
-            return total, np.where(judged[..., None], 0.0, total)[..., None], np.where(judged, 0, steps), judged
-        if self.block == 1:
-            return g, state.sums, steps, judged
-        sums = num.full(state.sums.shape, g[..., None])
-        sums[..., 1:] += state.sums[..., :-1]
-        return state.sums[..., -1] + g, sums, steps, judged
+            return total, np.where(judged[..., None], 0.0, total)[..., None]
+        sums = num.full(held.shape, new[..., None])
+        sums[..., 1:] += held[..., :-1]
+        return total, sums
+
+    def _scaled(self, plan: KfBankPlan, total: Array, count: Array) -> Array:
+        """Return sums (B, N, K) of `count` readings as sums of a whole block; a filter without a reading passes as the last that does."""
+        level = quantile(np.maximum(count, 1.0), plan.tail)
+        part = np.where(count > 0.0, total * (plan.threshold / np.where(level > 0.0, level, 1.0)), plan.threshold)
+        return np.where(count == plan.degrees, total, part)
 
 
 class BlockPlan(NamedTuple):

@@ -20,6 +20,7 @@ from tailgate import num
 from tailgate.base.errors import InputError
 from tailgate.core import Array, Model, Positive, param
 from tailgate.core.registry import register
+from tailgate.estimators.sparse_attacks.l1_decoder import dependent
 from tailgate.estimators.sparse_attacks.window import (
     Centred,
     Decoded,
@@ -28,6 +29,7 @@ from tailgate.estimators.sparse_attacks.window import (
     WindowPlan,
     floor_of,
     grams,
+    known,
     least_squares,
     modelled,
 )
@@ -159,15 +161,17 @@ class RobustDecoder(Decoder):
     def decode(self, plan: DecoderPlan, own: None, held: Centred) -> tuple[None, Decoded]:
         O, D = plan.window.O, plan.own.D
         gram = grams(O, held.there)
-        x = least_squares(O, held.Y, gram, np.ones(held.there.shape[:3]), floor_of(O))
+        every = np.ones(held.there.shape[:3])
+        x, answered = least_squares(O, held.Y, gram, every, floor_of(O)), np.array(known(held, gram, every))
         score = self.sigmas * np.max(np.where(held.there, np.abs(held.Y - modelled(O, x)), 0.0) / D, axis=(-2, -1))
         alarm = np.zeros_like(score, bool)
-        hard = held.full & ((score > self.sigmas) if self.centre == "least_squares" else np.ones_like(alarm))
+        hard = held.full & answered & ((score > self.sigmas) if self.centre == "least_squares" else np.ones_like(alarm))
         x = np.array(x)
         for b, i in np.argwhere(hard).tolist():
             Y, there = np.ascontiguousarray(held.Y[b, i]), np.ascontiguousarray(held.there[b, i])
-            if np.count_nonzero(there) < O.shape[-1]:
-                continue  # too much is missing to tell
             found = explanation(O[i], Y, D[i], there, self.s, self.centre)
             x[b, i], alarm[b, i] = found.x, bool(found.attacked) or not found.found
-        return None, Decoded(x, np.where(alarm, score, np.minimum(score, self.sigmas)), alarm)  # some x has all errors within the bounds
+            left = there & ~np.isin(np.arange(len(there)), found.attacked)[:, None]
+            answered[b, i] = not dependent(O[i][left])
+        score = np.where(alarm, score, np.minimum(score, self.sigmas))  # else some x has all errors within the bounds
+        return None, Decoded(x, score, alarm, answered)

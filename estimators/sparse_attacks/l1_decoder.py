@@ -36,6 +36,7 @@ from tailgate.estimators.sparse_attacks.window import (
     WindowPlan,
     floor_of,
     grams,
+    known,
     least_squares,
     modelled,
     pulled,
@@ -146,14 +147,14 @@ class L1Decoder(Relaxed):
     def decode(self, plan: DecoderPlan, own: None, held: Centred) -> tuple[None, Decoded]:
         O, units = plan.window.O, plan.own[..., None]
         rows, Y = O * units[..., None], held.Y * units
-        known = None
         if self.solver == "program":
-            x, known = num.zeros((*held.full.shape, O.shape[-1])), np.zeros_like(held.full)
+            x, answered = num.zeros((*held.full.shape, O.shape[-1])), np.zeros_like(held.full)
             for b, i in np.argwhere(held.full).tolist():
                 there = held.there[b, i]
                 if (one := programmed(rows[i][there], Y[b, i][there])) is not None:
-                    x[b, i], known[b, i] = one, True
+                    x[b, i], answered[b, i] = one, True
         else:
             x = decoded(grouped(rows, Y, held.there, self.norm), int(self.rounds))
+            answered = known(held, grams(O, held.there), np.ones(held.there.shape[:3]))
         score = np.max(np.where(held.there, np.abs(held.Y - modelled(O, x)), 0.0), axis=(-2, -1))
-        return None, Decoded(x, score, score > self.threshold, known)
+        return None, Decoded(x, score, score > self.threshold, answered)

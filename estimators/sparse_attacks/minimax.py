@@ -25,7 +25,7 @@ from tailgate.core.registry import register
 from tailgate.estimators.compose import AcceptAll, Composed, Score
 from tailgate.estimators.filters.kalman import KalmanFilter, KalmanPlan, KalmanState
 from tailgate.estimators.parts import Detector, Filter, Mitigation
-from tailgate.estimators.sparse_attacks.bank import BankPlan, bank_plan, summed
+from tailgate.estimators.sparse_attacks.bank import BankPlan, bank_plan, expected, summed
 from tailgate.estimators.sparse_attacks.subsets import MOST, require, without
 
 PAPER = "Y. Mo, B. Sinopoli, Secure Estimation in the Presence of Integrity Attacks, 2015"
@@ -75,7 +75,8 @@ class MinimaxFilter:
     def update(self, plan: MinimaxPlan, state: KalmanState, innovation: Innovation, accept: Array) -> KalmanState:
         if plan.bank is None or plan.inside is None:
             return state
-        d = summed(plan.bank.gain, np.where(accept, innovation.r, 0.0)[..., None])  # (B, N, n, I)
+        z = num.full((*innovation.r.shape, len(plan.bank.keep)), np.where(accept, innovation.r, 0.0)[..., None])
+        d = summed(plan.bank.gain, expected(plan.bank, z, accept))  # (B, N, n, I)
         by_set = d[..., plan.inside.ravel()].reshape(*d.shape[:3], *plan.inside.shape)
         low, high = np.max(np.min(by_set, axis=-1), axis=-1), np.min(np.max(by_set, axis=-1), axis=-1)
         return KalmanState(state.x + 0.5 * (low + high), None)

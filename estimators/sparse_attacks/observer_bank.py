@@ -9,8 +9,8 @@ An honest J bounds pi_J*, and an honest S in J* bounds the rest: |error| <= |err
 three times a bound that all honest sets share. A single Kalman filter on J may err more than every one on its subsets.
 
 `observer`: steady Kalman filters (bank.py). `gramian`: least squares on the last T readings, weighed by the noise.
-A lost reading counts as one that agrees with the last estimate. The alarm compares |x_J - x_S| with its own spread: for these filters
-cov(x_J - x_S) = P_S - P_J.
+A lost reading counts as one that agrees: with the others of its subset, or for `gramian` with the last estimate. The alarm compares
+|x_J - x_S| with its own spread: for these filters cov(x_J - x_S) = P_S - P_J.
 """
 
 from dataclasses import dataclass
@@ -137,7 +137,7 @@ class ObserverBank:
             y = np.where(received.valid, received.y, num.apply(here.C, ahead))
             window = window_step(here, state.window, received._replace(y=y, valid=np.ones_like(received.valid)), known_u)
             held = centred(plan.window, window)
-            flat = held.Y.reshape(*held.Y.shape[:2], -1)[..., None]
+            flat = held.Y.reshape(*held.Y.shape[:2], held.Y.shape[2] * held.Y.shape[3])[..., None]
             most, fewer = (_applied(bank.gain, flat) + held.xi[..., None] for bank in (plan.most, plan.fewer))
             full, first = held.full, window.kalman.x
         else:

@@ -5,10 +5,10 @@
     gradient    z <- z + L (Y - O x - E),   L = [O I]' / 2,   until f <= (1 - nu) f(after the last projection)
     project     keep the s blocks E_i of the largest norm, zero the others;   end where f <= eps
 
-`etpg` starts from E = 0 in each window. `etpl` goes on from its last z: x by A, E by a shift. x has coordinates in which O'O = I, so that
-|[O I]|^2 = 2 and the gradient's steps do not depend on how the states are scaled. eps is the energy T tr R that noise alone has. A window
-that passes the chi-square test of its least squares needs no attack: E = 0. The estimate is least squares on the sensors outside of the
-support of E, weighed by their noise.
+`etpg` starts from E = 0 in each window. `etpl` goes on from its last z: x by A, E by a shift, with the newest residual of each sensor.
+x has coordinates in which O'O = I, so that |[O I]|^2 = 2 and the gradient's steps do not depend on how the states are scaled. eps is the
+energy T tr R that noise alone has. A window that passes the chi-square test of its least squares needs no attack: E = 0. The estimate is
+least squares on the sensors outside of the support of E, weighed by their noise.
 """
 
 from dataclasses import dataclass
@@ -29,6 +29,7 @@ from tailgate.estimators.sparse_attacks.window import (
     WindowPlan,
     floor_of,
     grams,
+    known,
     least_squares,
     modelled,
     pulled,
@@ -160,16 +161,16 @@ class ProjectedGradient(Relaxed):
         x, E = weighed(np.ones(pull.shape[:3]), pull), np.zeros_like(held.Y)  # least squares of these rows, where all have arrived
         if own is not None:
             x = num.matvec(p.move, own.x) + num.matvec(p.turn, held.pushed)
-            moved = np.concatenate([own.E[..., 1:], own.E[..., -1:]], axis=-1)
-            newest = np.where(largest(own.E, self.s)[..., None], (scaled.Y - modelled(p.O, x))[..., -1:], 0.0)
-            E = np.concatenate([moved[..., :-1], newest], axis=-1)
+            newest = np.where(held.there, scaled.Y - modelled(p.O, x), 0.0)[..., -1:]
+            E = np.concatenate([own.E[..., 1:], newest], axis=-1)
         alarm = score > p.threshold
         found = solved(p, scaled, x, E, self.s, self.nu, int(self.rounds))
         support = alarm[..., None] & (num.dot(found.E, found.E) > 0.0)
-        x = least_squares(O, held.Y, gram, np.where(support, 0.0, 1.0), floor)
+        left = np.where(support, 0.0, 1.0)
+        x = least_squares(O, held.Y, gram, left, floor)
         if own is not None:
             own = ProjectedState(found.x, np.where(alarm[..., None, None], found.E, 0.0))
-        return own, Decoded(x, score, alarm)
+        return own, Decoded(x, score, alarm, known(held, gram, left))
 
 
 @register("defence", "etpg", reference=PAPER)

@@ -4,7 +4,7 @@
     O_i = [c_i; c_i A; ...; c_i A^(T-1)]  (T, n)                                                      xh(k) = A^(T-1) x(k-T+1) + xi(k)
 
 Rows are divided by the standard deviation of their sensor's noise: the unit of a reading decides nothing. Until T readings have come, a
-steady Kalman filter on all sensors gives the estimate.
+steady Kalman filter on all sensors gives the estimate. It does so too where those that arrived do not determine x.
 """
 
 from dataclasses import dataclass
@@ -21,6 +21,7 @@ from tailgate.estimators.sparse_attacks.subsets import require
 
 Length = Annotated[int, Field(ge=0, le=100)]
 WINDOW = "length T of the window; 0: the number of states [steps]"
+SINGULAR = 1e-10  # share of a column's square that is left without those before it, where it counts as a combination of them
 
 
 class WindowPlan(NamedTuple):
@@ -164,13 +165,28 @@ def solvable(G: Array) -> Array:
     return np.asarray(G + 1e-14 * trace[..., None, None] * np.eye(n))
 
 
+def determined(G: Array) -> Array:
+    """Return True (B, N) where rows with the gram G (B, N, n, n) determine x: no column is a combination of those before it."""
+    left, out = G, np.ones(G.shape[:2], bool)
+    for j in range(G.shape[-1]):
+        out = out & (left[..., j, j] > SINGULAR * G[..., j, j])
+        pivot = np.where(out, left[..., j, j], 1.0)
+        left = left - left[..., :, j, None] * (left[..., j, None, :] / pivot[..., None, None])
+    return np.asarray(out)
+
+
+def known(held: Centred, gram: Array, w: Array) -> Array:
+    """Return True (B, N) where the readings that arrived, of sensors with weights w (B, N, q) of 1, determine x; always if all arrived."""
+    return held.there.all(axis=(-2, -1)) | determined(weighed(w, gram))
+
+
 class Decoded(NamedTuple):
     """A decoder's answer for one window."""
 
     x: Array  # (B, N, n) at the window's start
     score: Array  # (B, N)
     alarm: Array  # (B, N) bool
-    known: Array | None = None  # (B, N) bool: there is an answer; None: for all
+    known: Array  # (B, N) bool: there is an answer
 
 
 class DecoderPlan(NamedTuple):
@@ -218,7 +234,7 @@ class Decoder:
         window = window_step(plan.window, state.window, received, known_u)
         held = centred(plan.window, window)
         own, found = self.decode(plan, state.own, held)
-        known = held.full if found.known is None else held.full & found.known
+        known = held.full & found.known
         x = np.where(known[..., None], num.matvec(plan.window.last, found.x) + held.xi, window.kalman.x)
         score, alarm = np.where(known, found.score, 0.0), known & found.alarm
         return DecoderState(window, own), Estimate(
