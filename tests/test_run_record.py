@@ -62,6 +62,8 @@ def test_a_run_says_what_it_took(suite: Path, tmp_path: Path, capsys: pytest.Cap
         assert "run: no new row was played" in capsys.readouterr().err
         assert _held(folder) == held and (folder / "board.json").read_bytes() == board
     (folder / "rows.jsonl.xz").unlink()
+    played = load_suite(str(suite))
+    assert [len(run_record.Record(played, folder, 1, keeps).before) for keeps in (True, False)] == [1, 0]
     assert len(_held(_run(suite, tmp_path / "out"))["commands"]) == 1  # begun anew: nothing was left of it
     assert (folder / "board.json").read_bytes() == board
 

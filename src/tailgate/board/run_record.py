@@ -1,7 +1,7 @@
 """The writer of run.json (`tailgate.board.attachments.Run`): what it took to play a board.
 
-A resumed run adds up its commands; where no rows are left it begins again. `kept` is null while rows are being played. More rows played
-than the board has (`again`) means that newer sources played some of them once more.
+A resumed run adds up its commands, and so does one that keeps a board's entries. Without rows any other begins again. `kept` is null while
+rows are being played. More rows played than the board has (`again`) means that newer sources played some of them once more.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ def processor_time() -> float:
 class Record:
     """The clock and the counts of one command that plays a suite into a folder; both begin when it is made."""
 
-    def __init__(self, suite: Suite, folder: Path, workers: int) -> None:
+    def __init__(self, suite: Suite, folder: Path, workers: int, keeps: bool = False) -> None:
         self.suite, self.path = suite, folder / Run.FILE
         sweep(self.path)
-        left = any(any(folder.glob(pattern)) for pattern in ("rows*.jsonl*", ".rows*.parts"))
+        left = keeps or any(any(folder.glob(pattern)) for pattern in ("rows*.jsonl*", ".rows*.parts"))
         held = Run.of(self.path) if left else None
         self.before = held.commands if held is not None and held.hash == suite.hash else []
         self.began, self.used, self.written, self.played = time.perf_counter(), processor_time(), time.perf_counter(), 0

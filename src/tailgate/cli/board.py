@@ -84,7 +84,7 @@ def _run(options: argparse.Namespace) -> int:
             locks.enter_context(alone(folder))
         for suite in suites:
             folder = out / suite.name
-            record = Record(suite, folder, options.workers)
+            record = Record(suite, folder, options.workers, options.keep_entries)
             if not options.score_only:
                 counting = record.counting(lambda name, done, total: update(name, done, total, cells(done, total)))
                 rows = play(
