@@ -243,7 +243,7 @@ def small_ensemble(monkeypatch):
 def shrink_ensemble(monkeypatch):
     """Make the standard attack ensemble small until the patch is undone."""
     from tailgate.agents.policy.zoo import zoo_names
-    from tailgate.ensemble import members, networks, standard
+    from tailgate.ensemble import evolution, members, networks, standard
     from tailgate.ensemble import search as searching
 
     few = zoo_names()[::5]
@@ -252,7 +252,8 @@ def shrink_ensemble(monkeypatch):
     effort = searching.Effort(64, 3)
     budget = members.Budget(effort, effort, 6, ((2, 8), (1, 8)), members.Pace(16, 1, 1, 8))
     monkeypatch.setitem(members.BUDGETS, "quick", budget)
-    for name, value in (("JUDGED", 64), ("SHOWN", 8), ("COPIED", 64)):
+    monkeypatch.setattr(evolution, "JUDGED", 64)
+    for name, value in (("SHOWN", 8), ("COPIED", 64)):
         monkeypatch.setattr(networks, name, value)
     monkeypatch.setattr(members, "FINALISTS", 1)
     for name, value in (("FINAL", 16), ("MORE", 8), ("KEPT", 8)):

@@ -15,10 +15,11 @@ from tailgate.core.kinds import EFFECTS, Kind
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_suite
 from tailgate.engine.agreement import Untraced
-from tailgate.ensemble import networks
+from tailgate.ensemble import evolution, networks
 from tailgate.ensemble import search as searching
 from tailgate.ensemble.battery import Played, Scripts, battery_of, played_plainly, remembered
-from tailgate.ensemble.networks import Evolution, Race, _without_copies, learned, ramp_of, starts_of
+from tailgate.ensemble.evolution import Evolution
+from tailgate.ensemble.networks import Race, _without_copies, learned, ramp_of, starts_of
 from tailgate.ensemble.search import Arena, Effort, search
 from tailgate.ensemble.space import FAMILIES, GENES, NEVER
 from tailgate.play.metrics import METRICS
@@ -178,13 +179,17 @@ def car_starts():
 def test_a_policy_is_played_as_its_file_says(tmp_path, monkeypatch):
     """One program plays policies of any weights, to the bit of `evaluate`."""
     place = arena("car")
-    monkeypatch.setattr(networks, "JUDGED", 64)
-    run, rng = Evolution(place, "black", car_starts()[0], 8, 0), np.random.default_rng(0)
-    for _ in range(2):
-        theta = run.first + rng.standard_normal(run.first.size)
+    monkeypatch.setattr(evolution, "JUDGED", 64)
+    run, rng = Evolution(place, "black", car_starts()[0]), np.random.default_rng(0)
+    thetas = [run.first + rng.standard_normal(run.first.size) for _ in range(2)]
+    played = run.played(thetas, "tune", 0, EPISODES)
+    for theta, one in zip(thetas, played, strict=True):
         run.champion = (0.0, theta)
         wanted, _ = as_evaluated(place, run.write(tmp_path, 0))
-        assert_same(place, run.played(theta, run.episodes_of("tune", 0, EPISODES)), wanted, "policy")
+        assert_same(place, one, wanted, "policy")
+    run.battery = Untraced("as if the engine did not trace the defence")
+    for plain, one in zip(run.played(thetas, "tune", 0, EPISODES), played, strict=True):
+        assert_same(place, plain, one, "policy in the plain loop")
 
 
 @pytest.mark.long
@@ -208,7 +213,7 @@ def test_a_published_start_keeps_its_kinds(tmp_path):
     """A published policy that learned with fewer kinds than are granted goes on with its own, and its file says so."""
     place = arena("car")
     start = next(one for one in car_starts() if one.name.startswith("zoo"))
-    wanted, attacks = as_evaluated(place, Evolution(place, "black", start, 8, 0).write(tmp_path, 0))
+    wanted, attacks = as_evaluated(place, Evolution(place, "black", start).write(tmp_path, 0))
     assert attacks
     again, _ = as_evaluated(place, f"zoo:name={start.name.partition(' ')[2]}")
     np.testing.assert_array_equal(wanted.gap, again.gap)

@@ -2,7 +2,7 @@
 
 import contextlib
 import io
-from functools import partial
+import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -55,21 +55,23 @@ def test_a_terminal_keeps_the_last_bars(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_searches_in_other_processes_are_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A search notes its percent in a file, which is read while it runs and removed in the end."""
-    job: Any = type("Job", (), {"name": "one"})()
+    """A search notes its percent and its best attack in a file, which is read while it runs and removed in the end."""
+    job = _job(3)
     note, seen, told = standard._note(job, tmp_path), [], []
 
     def search(_: Any, folder: Path, tell: Any) -> dict[str, Any]:
-        tell(1, 4, "", 0.0)
-        seen.append(note.read_bytes())
-        while not told or told[-1] != 25:
+        tell(1, 4, "a script", 0.0)
+        seen.append(json.loads(note.read_bytes()))
+        while not told or told[-1][0] != 25:
             pass
         return {}
 
     monkeypatch.setattr(standard, "PAUSE", 0.01)
-    with standard._followed([note, tmp_path / "none"], told.append):
-        assert partial(standard._noted, search)(job, tmp_path) == {}
-    assert seen == [b"25"] and 25 in told and not note.exists()
+    monkeypatch.setattr(standard, "search", search)
+    with standard._followed([note, tmp_path / "none"], lambda *words: told.append(words)):
+        assert standard._noted(job, tmp_path) == {}
+    text = ", road, dose 3: a script"
+    assert seen == [[25, text]] and (25, text) in told and not note.exists()
 
 
 def _job(number: int) -> Any:
@@ -102,19 +104,20 @@ def test_a_search_that_ends_takes_nothing_back(tmp_path: Path, monkeypatch: pyte
     assert told == [0, 200, 150, 200, 150, 200, 150, 200, 200, 200]
 
 
-def test_searches_in_turn_count_together(tmp_path: Path) -> None:
+def test_searches_in_turn_count_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told = []
 
-    def one(job: Any, _: Path, tell: Any) -> dict[str, Any]:
+    def search(job: Any, _: Path, tell: Any) -> dict[str, Any]:
         tell(1, 4, "the best so far", 0.0)
         return _found()
 
-    standard.searched([_job(0), _job(1)], tmp_path, 1, lambda *words: told.append(words), one=one)
+    monkeypatch.setattr(standard, "search", search)
+    standard.searched([_job(0), _job(1)], tmp_path, 1, lambda *words: told.append(words))
     assert told[1] == ("searches", 25, 200, "0 of 2, road, dose 0: the best so far")
     assert [words[1] for words in told] == [0, 25, 100, 125, 200]
 
 
-def test_a_folder_that_takes_no_notes_ends_no_search(tmp_path: Path) -> None:
-    job: Any = type("Job", (), {"name": "one"})()
+def test_a_folder_that_takes_no_notes_ends_no_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "searches").write_text("a file")
-    assert standard._noted(lambda _, folder, tell: tell(1, 4, "", 0.0) or {}, job, tmp_path) == {}
+    monkeypatch.setattr(standard, "search", lambda _, folder, tell: tell(1, 4, "", 0.0) or {})
+    assert standard._noted(_job(1), tmp_path) == {}

@@ -12,11 +12,12 @@ from tailgate.board import score
 from tailgate.core.draws import Draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_suite
+from tailgate.core.veil import veiled
 from tailgate.evaluation.cells import evaluate
 from tailgate.evaluation.rounds import seeds_of
 from tailgate.evaluation.verify import verify
 from tailgate.sandbox import play_submission
-from tailgate.sandbox.isolated import IsolatedPlan, _shown, veiled
+from tailgate.sandbox.isolated import IsolatedPlan, _shown
 from tailgate.training.adaptive import configs_of, train_against
 
 pytestmark = pytest.mark.skipif(shutil.which("bwrap") is None, reason="bubblewrap is not installed")
@@ -51,15 +52,15 @@ def test_it_plays_as_it_would_here_and_nobody_looks_into_it(folder: Path) -> Non
 
 
 def test_training_does_not_show_in_the_keys_that_it_draws_with() -> None:
-    """Within a veil the same episode has the same key, another one another, and no key or number of an episode is the real one."""
-    key, episode = np.array([5, 5, 9, 9], np.uint64), np.array([0, 1, 0, 1], np.uint32)
+    """Within a veil a row keeps its key, each has another, also of one episode, and no key or number of an episode is the real one."""
+    key, episode = np.array([5, 5, 9, 9], np.uint64), np.array([0, 1, 0, 0], np.uint32)
     drawn, plan = Draws(key, episode, np.zeros(4, np.uint32), 0), IsolatedPlan(None, None)
     assert _shown(plan, drawn)[0] is key and _shown(plan, drawn)[1] is episode
     seen = []
     for _ in range(2):
         with veiled():
             first, number = _shown(plan, drawn)
-            later, _ = _shown(plan, drawn._replace(episode=np.array([0, 2, 0, 1], np.uint32)))
+            later, _ = _shown(plan, drawn._replace(episode=np.array([0, 2, 0, 0], np.uint32)))
             again, _ = _shown(IsolatedPlan(None, None), drawn)
         assert np.array_equal(first, again) and (first == later).tolist() == [True, False, True, True] and not number.any()
         seen += [*first.tolist(), later[1]]

@@ -5,8 +5,8 @@ import dataclasses
 import json
 import lzma
 import shutil
-from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ from tailgate.cli import main
 from tailgate.core import draws
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_suite
+from tailgate.core.veil import secret
 from tailgate.ensemble import networks, search, standard
 from tailgate.ensemble.battery import Played
 from tailgate.ensemble.search import Arena
@@ -142,7 +143,7 @@ def test_a_rank_asks_for_the_searches(made: tuple[Path, Path]) -> None:
     empty = [cell | {"members": []} for cell in line["cells"]]
     assert why([line | {"cells": empty}]) == "the search on braking at dose 4 is not whole: no member scripts"
     idle = [cell | {"members": [one | {"attack": None} for one in cell["members"]]} for cell in line["cells"]]
-    assert why([line | {"cells": idle}]).endswith("not whole: not one attack of a black box")
+    assert why([line | {"cells": idle}]).endswith("not whole: no attack of a black box")
     left = [cell | {"members": [one | {"damage": None, "attack": None, "why": standard.ELSEWHERE} for one in cell["members"]]} for cell in line["cells"]]
     assert why([line | {"cells": left}]).endswith("not whole: scripts did not search")
     assert why([line | {"cells": []}]) == "the ensemble has not attacked it on braking at dose 4"
@@ -258,21 +259,23 @@ def test_a_round_has_a_search_of_its_own() -> None:
 
 def test_a_class_in_a_sandbox_is_searched_behind_the_veil(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It could be weak where it is searched and strong where it is scored, if it knew the keys of the episodes."""
-    from tailgate.sandbox import isolated
-
-    seen: list[bytes | None] = []
-    monkeypatch.setattr(standard, "search", lambda *_: seen.append(isolated._veil.get()))
-    monkeypatch.setattr(searched, "jobs_of", lambda *_: [])
-
-    def given(jobs: object, folder: Path, workers: int, progress: object, announce: object, one: Callable[..., object] | None) -> None:
-        (one or standard.search)(None, folder)
-        pytest.fail("seen enough")
-
-    monkeypatch.setattr(searched, "searched", given)
+    seen: list[bytes] = []
+    monkeypatch.setattr(standard, "_search", lambda *_: seen.append(secret()) or {})
     for text in ("bwrap/mydefence:Mine", "chi2_kf"):
-        with pytest.raises(pytest.fail.Exception, match="seen enough"):
-            searched.search(load_suite("radar-v1"), text, tmp_path, workers=1)
+        standard.search(SimpleNamespace(arena=SimpleNamespace(defence=text)), tmp_path)  # type: ignore[arg-type]
     assert seen[0] and not seen[1]
+
+
+def test_a_gradients_program_competes_with_black_boxes(tmp_path: Path) -> None:
+    """It knows the defence while it is looked for and only the road when it is played: a stronger white box does not replace it."""
+    def member(name: str, knowledge: str, attack: str, score: float) -> dict[str, Any]:
+        return {"member": name, "knowledge": knowledge, "why": "", "found": [{"attack": attack, "damage": score, "score": score}]}
+
+    members = [
+        member("scripts", "black", "fdi:value=-1", 0.1), member("white box", "white", "stealth", 0.9), member("gradient", "white", "fdi:value=-2", 0.5),
+    ]  # fmt: skip
+    cell = searched._cell({"scenario": "road", "dose": 4, "listed": None, "members": members}, tmp_path)
+    assert [one["attack"] for one in cell["members"]] == ["fdi:value=-1", "stealth", "fdi:value=-2"]
 
 
 def test_two_boards_in_a_folder_are_refused(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ the rows, and the board holds them, so that it can be scored without them.
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import json
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
@@ -24,9 +25,8 @@ from tailgate.core.spec_text import MARKS
 from tailgate.core.threat import KNOWLEDGE
 from tailgate.ensemble import standard
 from tailgate.ensemble.members import MEMBERS
-from tailgate.ensemble.standard import NAME, Job, Progress, jobs_of, searched
+from tailgate.ensemble.standard import NAME, Progress, jobs_of, searched
 from tailgate.evaluation.rows import Row
-from tailgate.sandbox.isolated import veiled
 from tailgate.training.adaptive import Adaptive, plan_of, stem
 
 from .damage import PLAYED, SKIPPED, Table
@@ -55,16 +55,18 @@ def search(
     Raises
     ------
     InputError
-        For a suite whose plan asks for no ensemble, and for a path that cannot be part of an attack's text.
+        For a suite whose plan asks for no ensemble, without PyTorch, and for a path that cannot be part of an attack's text.
     """
     plan = plan_of(suite)
+    if importlib.util.find_spec("torch") is None:
+        raise InputError("torch", None, "PyTorch, which a member of the ensemble needs: pip install 'tailgate[train]'")
     if set(str(out)) & set(MARKS):
         raise InputError("--out", str(out), f"a path without any of {MARKS}, as the texts of attacks hold it")
     jobs = jobs_of(suite, defence, (), plan.searched(suite), plan.ensemble, seed_of(beacon), suite.nominal)
     spec = Spec("defence", defence)
     folder = writable_directory(out / "searches" / stem(defence))
     with alone(folder):
-        results = searched(jobs, folder, workers, progress, announce, _veiled if spec.sandboxed else None)
+        results = searched(jobs, folder, workers, progress, announce)
     line: Data = {
         "defence": spec.target, "digest": spec.digest, "version": spec.entry.version, "ensemble": NAME, "budget": plan.ensemble,
         "seed": seed_of(beacon), "cells": [_cell(result, out / "found") for result in results],
@@ -78,19 +80,14 @@ def seed_of(beacon: str) -> int:
     return int.from_bytes(hashlib.blake2b(beacon.encode(), digest_size=4).digest(), "big") if beacon else 0
 
 
-def _veiled(job: Job, folder: Path, tell: Callable[[int, int, str, float], None] | None = None) -> Data:
-    """Run one search; a class in a sandbox cannot tell its episodes from those that count."""
-    with veiled():
-        return standard.search(job, folder, tell)
-
-
 def _cell(result: Data, folder: Path) -> Data:
     """Return what every member found in one search; the files of what is played are copied to a folder."""
     best = {one["member"]: one["found"][0] for one in result["members"] if one["found"]}
-    classes = {one["member"]: one["knowledge"] for one in result["members"]}
+    looked = {one["member"]: one["knowledge"] for one in result["members"]}
+    plays = {member: Spec("attack", found["attack"]).entry.knowledge for member, found in best.items()}  # a gradient's program: black
     chosen = {
         max(mine, key=lambda member: best[member]["score"])
-        for level in KNOWLEDGE if (mine := [member for member in best if classes[member] == level])
+        for classes in (looked, plays) for level in KNOWLEDGE if (mine := [member for member in best if classes[member] == level])
     }  # fmt: skip
     return {
         "scenario": result["scenario"], "dose": result["dose"], "listed": (result["listed"] or {}).get("damage"),
@@ -192,7 +189,7 @@ def unsearched(table: Table, row: Row, searches: Sequence[Data], plan: Adaptive)
 
 
 def _lacking(cell: Data, whole: bool) -> str:
-    """Return what a search has and a cell has not: every member with damage or a reason, and one attack of each knowledge.
+    """Return what a search has and a cell has not: every member with damage or a reason, and an attack of each knowledge.
 
     whole: all members search here, so that none may leave it to another scenario.
     """
@@ -206,8 +203,8 @@ def _lacking(cell: Data, whole: bool) -> str:
             return f"{name} did not search"
     for level in KNOWLEDGE:
         mine = [one for one in members.values() if one["knowledge"] == level and one["damage"] is not None]
-        if mine and sum(one["attack"] is not None for one in mine) != 1:
-            return f"not one attack of a {level} box"
+        if mine and not any(one["attack"] is not None for one in mine):
+            return f"no attack of a {level} box"
     return ""
 
 

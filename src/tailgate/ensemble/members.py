@@ -41,9 +41,10 @@ class Budget:
         """The search of policies."""
         return Race(self.population, tuple(Phase(*phase) for phase in self.phases))
 
-    def episodes(self, agents: int, whole: bool = True) -> int:
+    def episodes(self, agents: int, whole: bool = True, traced: bool = True) -> int:
         """Return the episodes that all members play in a scenario, about; those that do not learn unless `whole`."""
-        races = self.race.episodes(STARTS, agents) + self.race.episodes(GREY + PUBLISHED, agents)
+        race = self.race if traced else self.race.shorter()
+        races = race.episodes(STARTS, agents) + race.episodes(GREY + PUBLISHED, agents)
         return self.scripts.episodes(agents) + self.programs.episodes(agents) + (races if whole else 0)
 
 

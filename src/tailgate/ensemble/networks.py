@@ -2,7 +2,7 @@
 
 A start is a network that rests, one that imitates the best script found so far, or a published policy. All starts learn for some
 generations. The better half goes on with more episodes a generation, which leaves less of the members' order to chance.
-The method is CMA-ES with a diagonal covariance (Ros and Hansen 2008). One compiled program plays all: its parameters are the weights.
+A defence that is not traced has a shorter race (evolution.py).
 """
 
 from __future__ import annotations
@@ -18,21 +18,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tailgate.agents.learners.cem import Shape, imitation, lean, scales
-from tailgate.agents.learners.learning import header_of
 from tailgate.agents.learners.teacher import Demonstration, demonstrate
-from tailgate.agents.policy.network_policy import PolicyAttack, PolicyPlan, save_policy
+from tailgate.agents.policy.network_policy import PolicyPlan
 from tailgate.agents.policy.zoo import ZooAttack, zoo_names
 from tailgate.base.errors import InputError, NotApplicable
-from tailgate.core import Array, draws
-from tailgate.core.draws import Keys, Role
 from tailgate.core.kinds import Kind
 from tailgate.core.loop import Loop
 from tailgate.core.neural import Network
 from tailgate.core.registry import Spec
-from tailgate.core.schema import as_data, digest
-from tailgate.engine.agreement import ROWS, Untraced
-from tailgate.engine.parameters import Parameters
-from tailgate.ensemble.battery import Battery, Episodes, Played, battery_of
+from tailgate.ensemble.evolution import JUDGED, SHORTER, ZOO, Evolution, Start
 from tailgate.ensemble.search import Arena, Tell
 from tailgate.envs.gym.actions import ActionCodec, ActionSpec
 from tailgate.envs.gym.attacker_mdp import Seat
@@ -43,13 +37,10 @@ HIDDEN, REST = 16, 0.5  # width of the hidden layer; how much a network leans to
 SEEN = 4  # steps that a linear policy sees, so that it can time bursts and pauses
 FIRST_RATE = 0.2  # of the first value of a ramp that is made from a script of one size: its rate
 SHOWN = 128  # episodes of the script that a network imitates, for a system of one agent
-SPREAD = 0.3  # of the first generation: of the size of a network's weights, and by itself where they are 0
 RAMP = (1, 3, 9)  # steps of a ramp whose sizes a policy may send
 COPIED = 1024  # decisions of a script in a step of its imitation
-JUDGED = 1024  # episodes that decide which starts go on, for a system of one agent
 LEAST, FEWEST = 16, 8  # policies of a generation, and episodes that each plays, at least
-FIRST = 1 << 30  # number of the first episode that starts are judged on: no search meets it before
-PUBLISHED, ZOO = 2, "zoo "  # policies of the zoo that join, at most; how their names begin
+PUBLISHED = 2  # policies of the zoo that join, at most
 SLOWEST = 1e-3  # of the bound: the slowest ramp
 
 
@@ -70,6 +61,11 @@ class Race:
     def members(self, agents: int) -> int:
         """Return the policies of a generation."""
         return max(self.population // agents, min(LEAST, self.population))
+
+    def shorter(self) -> Race:
+        """Return the race in the plain loop."""
+        phases = tuple(phase._replace(generations=max(phase.generations // SHORTER, 1)) for phase in self.phases)
+        return Race(min(self.population, LEAST), phases)
 
     def episodes(self, starts: int, agents: int) -> int:
         """Return the episodes that a race plays."""
@@ -93,109 +89,6 @@ class Form(NamedTuple):
 
 FORMS = (Form(1, HIDDEN), Form(SEEN, 0))  # of policies that choose among sizes
 RAMPING = Form(1, 0)  # of policies that move a value
-
-
-class Start(NamedTuple):
-    """A first network, and the actions that its outputs choose among."""
-
-    name: str
-    plan: PolicyPlan
-    size: Array  # (d,) standard deviation of each observation: the less one varies, the larger are the changes of its weights
-    script: str = ""  # that it imitates
-
-    @property
-    def rests(self) -> bool:
-        """If all its weights but a bias are 0."""
-        return not self.script and not self.name.startswith(ZOO)
-
-
-class Evolution:
-    """One start: a distribution of weights that moves towards what does more harm."""
-
-    def __init__(self, arena: Arena, knowledge: str, start: Start, population: int, seed: int) -> None:
-        from cmaes import SepCMA  # imports scipy's statistics
-
-        self.arena, self.start, self.attack, self.loop = arena, start, PolicyAttack(), arena.seat(knowledge)
-        self.episode = 0
-        network = start.plan.network
-        parts = [part for pair in zip(network.weights, network.biases, strict=True) for part in pair]
-        self.shape = Shape(tuple(itertools.pairwise((len(network.weights[0]), *map(len, network.biases)))))
-        self.mean = self.first = np.concatenate([part.ravel() for part in parts])
-        reads = [np.ones_like(part) for part in parts]
-        reads[0] /= start.size[:, None]
-        sizes = [np.sqrt(np.mean((part / read) ** 2)) or 1.0 for part, read in zip(parts, reads, strict=True)]
-        if start.rests:
-            sizes = [1.0] * len(parts)
-        self.unit = SPREAD * np.concatenate([(size * read).ravel() for size, read in zip(sizes, reads, strict=True)])
-        self.method = SepCMA(np.zeros(self.first.size), 1.0, population_size=population, seed=seed)
-        self.battery = self._battery(population)
-        held = Parameters((self.loop, self.attack, start.plan))
-        self._values = held.values
-        self._places = [
-            next(i for i, leaf in enumerate(held.values) if np.shares_memory(leaf, part)) for part in (*network.weights, *network.biases)
-        ]  # fmt: skip
-        self.champion = (self.judged(), self.mean)
-
-    def _battery(self, population: int) -> Battery:
-        few = self._memory(draws.keys("tune", range(ROWS)))
-        made = battery_of(self.loop, self.attack, self.start.plan, few)
-        if isinstance(made, Untraced):
-            raise NotApplicable("defence", self.arena.defence, f"one that the engine traces, to learn against it ({made.why})")
-        return made
-
-    def _memory(self, keys: Keys) -> object:
-        batch = len(keys.key)
-        return self.attack.start(self.start.plan, batch, keys.at(Role.ATTACK, np.zeros(batch, np.int64)))
-
-    def episodes_of(self, purpose: str, first: int, count: int) -> Episodes:
-        """Return episodes of this learner's game."""
-        keys = draws.keys(purpose, range(first, first + count))
-        return Episodes(self.battery, keys, self._memory(keys))
-
-    def played(self, theta: Array, episodes: Episodes) -> Played:
-        """Return the outcome of the policy with the weights theta (length,) on episodes."""
-        weights, biases = zip(*self.shape.layers(theta), strict=True)
-        values = list(self._values)
-        for place, part in zip(self._places, (*weights, *biases), strict=True):
-            values[place] = np.ascontiguousarray(part).ravel()
-        return episodes.play(values)
-
-    def generation(self, count: int) -> float:
-        """Play a generation, each member on the same fresh episodes, and move; return the mean payment of its better half."""
-        episodes, reach = self.episodes_of("train", self.episode, count), self.arena.reach("train", self.episode, count)
-        self.episode += count
-        asked = [self.method.ask() for _ in range(self.method.population_size)]
-        paid = [float(np.mean(self.arena.payment(self.played(self.first + self.unit * z, episodes), reach))) for z in asked]
-        self.method.tell([(z, -one) for z, one in zip(asked, paid, strict=True)])
-        self.mean = self.first + self.unit * self.method.mean
-        return float(np.mean(sorted(paid)[len(paid) // 2 :]))
-
-    def judged(self) -> float:
-        """Return the mean score of the mean policy on the episodes that judge all starts."""
-        count = max(JUDGED // self.loop.model.agents, ROWS)
-        played = self.played(self.mean, self.episodes_of("tune", FIRST, count))
-        return float(np.mean(self.arena.score(played, self.arena.reach("tune", FIRST, count))))
-
-    def compare(self) -> None:
-        """Keep the mean policy as champion if it does better than the one that is held."""
-        score = self.judged()
-        if score > self.champion[0]:
-            self.champion = (score, self.mean)
-
-    def write(self, folder: Path, seed: int) -> str:
-        """Write the champion below a folder; return it as an attack on the command line."""
-        plan, arena = self.start.plan, self.arena
-        weights, biases = zip(*self.shape.layers(self.champion[1]), strict=True)
-        training: dict[str, Any] = {
-            "summary": "learned by the standard attack ensemble", "start": self.start.name, "seed": seed, "episodes": self.episode,
-            "config": {"scenario": arena.scenario, "threat": dict(arena.threat)}, "threat_model": as_data(plan.action.brief.threat),
-        }  # fmt: skip
-        if not Spec("defence", arena.defence).imports:  # a file shall not name somebody's class
-            training["config"]["defence"] = arena.defence
-        header = header_of(Seat(self.loop, plan.action, plan.observation, Reward(), {}), training)
-        knowledge, dose = self.loop.threat.knowledge, "own" if arena.dose is None else arena.dose
-        name = f"{arena.name}-{dose}-{knowledge}-{digest([as_data(arena), self.start.name, seed])}"
-        return f"policy:path={save_policy(folder / 'policies' / name, Network(weights, biases), header)}"
 
 
 def action_of(arena: Arena, scripts: Sequence[str]) -> ActionSpec:
@@ -332,11 +225,12 @@ def learned(
     Raises
     ------
     NotApplicable
-        Where the defence is not traced, as a policy would be learned too slowly, and where there is nothing to choose.
+        Where there is nothing to choose.
     """
-    members = race.members(arena.loop.model.agents)
-    starts = starts_of(arena, knowledge, scripts, seed, only)
-    runs = _without_copies([Evolution(arena, knowledge, start, members, seed) for start in starts])
+    runs = _without_copies([Evolution(arena, knowledge, start) for start in starts_of(arena, knowledge, scripts, seed, only)])
+    race = race if all(run.traced for run in runs) else race.shorter()
+    for run in runs:
+        run.enter(race.members(arena.loop.model.agents), seed)
     left, total, done = list(runs), sum(phase.generations for phase in race.phases), 0
     for phase in race.phases:
         episodes = max(phase.episodes // arena.loop.model.agents, FEWEST)

@@ -95,14 +95,29 @@ class Arena:
 
     def seat(self, knowledge: str, attack: Attack | None = None) -> Loop:
         """Return the loop for attacks of this knowledge, or for one that says itself what it has to see."""
+        if attack is None and knowledge in self._seats:
+            return self._seats[knowledge]
         defence = Spec("defence", self.defence)
         none: Attack = Spec("attack", "none").make()
-        return self.cell("none").place(none if attack is None else attack, knowledge).loop(defence.make(), defence.entry.uses)
+        loop = self.cell("none").place(none if attack is None else attack, knowledge).loop(defence.make(), defence.entry.uses)
+        if attack is None:
+            self._seats[knowledge] = loop
+        return loop
+
+    @cached_property
+    def _seats(self) -> dict[str, Loop]:
+        return {}
 
     @cached_property
     def loop(self) -> Loop:
         """The loop, with an attacker who knows what the road shows."""
         return self.seat("black")
+
+    @cached_property
+    def traced(self) -> bool:
+        """If the engine traces the defence."""
+        none: Attack = Spec("attack", "none").make()
+        return not isinstance(battery_of(self.loop, none, none.prepare(self.loop.brief), None), Untraced)
 
     @cached_property
     def space(self) -> Space:

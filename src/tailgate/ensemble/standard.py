@@ -11,7 +11,6 @@ import json
 import tempfile
 import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +24,7 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_scenario
 from tailgate.core.schema import digest
 from tailgate.core.spec_text import MARKS
+from tailgate.core.veil import veiled
 from tailgate.ensemble import journal
 from tailgate.ensemble.gradient import gradient_masking
 from tailgate.ensemble.members import BUDGETS, MEMBERS, Harvest, Hunt, harvest
@@ -103,7 +103,8 @@ def expected(jobs: Sequence[Job], workers: int) -> float:
     arena = jobs[0].arena
     if not arena.space.families:
         return 0.0
-    steps = sum(BUDGETS[job.budget].episodes(job.arena.loop.model.agents, job.whole) * job.arena.loop.horizon for job in jobs)
+    traced = arena.traced
+    steps = sum(BUDGETS[job.budget].episodes(job.arena.loop.model.agents, job.whole, traced) * job.arena.loop.horizon for job in jobs)
     return REST * steps / (arena.speed() * arena.loop.horizon) / min(workers, len(jobs))
 
 
@@ -111,7 +112,13 @@ def search(job: Job, folder: Path, tell: Callable[[int, int, str, float], None] 
     """Run one search; return what every member found, and the best attack that the suite lists, on the same select episodes.
 
     folder: where files of attacks are written, and a journal: an interrupted search goes on behind the last member that was done.
+    A class in a sandbox sees neither the numbers of its episodes nor that they are searched.
     """
+    with veiled() if Spec("defence", job.arena.defence).sandboxed else contextlib.nullcontext():
+        return _search(job, folder, tell)
+
+
+def _search(job: Job, folder: Path, tell: Callable[[int, int, str, float], None] | None) -> dict[str, Any]:
     arena = job.arena
     hunt = Hunt(arena, BUDGETS[job.budget], job.seed, folder / "attacks" / job.name, tell, () if job.whole else UNLEARNED)
     notes = _journal(job, folder)
@@ -125,7 +132,7 @@ def search(job: Job, folder: Path, tell: Callable[[int, int, str, float], None] 
 
 def searched(
     jobs: Sequence[Job], folder: Path, workers: int = 1, progress: Progress | None = None,
-    announce: Callable[[float], None] | None = None, one: Callable[..., dict[str, Any]] | None = None,
+    announce: Callable[[float], None] | None = None,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Run searches, and return their results in order (`search`). Those that the folder has are not run again.
 
@@ -135,15 +142,13 @@ def searched(
         Its `searches` has the results, its `attacks` the files of programs and policies.
     announce
         Called with the seconds that the searches will take, about, before they begin.
-    one
-        Runs one search, in a process where there are several; by default `search`.
 
     Raises
     ------
     InputError
         For a damaged result.
     """
-    update, one = progress or (lambda *_: None), one or search
+    update = progress or (lambda *_: None)
     done = {i: held for i, job in enumerate(jobs) if (held := _kept(job, folder)) is not None}
     left = [i for i in range(len(jobs)) if i not in done]
     if announce is not None and left:
@@ -168,12 +173,12 @@ def searched(
         for note in notes:
             note.unlink(missing_ok=True)  # of a run that was killed
         with _followed(notes, show):
-            for number, result in each(partial(_noted, one), [(jobs[i], folder) for i in left], workers):
+            for number, result in each(_noted, [(jobs[i], folder) for i in left], workers):
                 finish(left[number], result)
     else:
         for i in left:
             place = f", {jobs[i].arena.scenario}, dose {jobs[i].arena.dose}: "
-            finish(i, one(jobs[i], folder, lambda n, of, text, mean, place=place: show(100 * n // of, place + text)))  # type: ignore[misc]
+            finish(i, search(jobs[i], folder, lambda n, of, text, mean, place=place: show(100 * n // of, place + text)))  # type: ignore[misc]
     return [done[i] for i in range(len(jobs))]
 
 
@@ -187,33 +192,35 @@ def _note(job: Job, folder: Path) -> Path:
     return _file(job, folder).with_suffix(".progress")
 
 
-def _noted(one: Callable[..., dict[str, Any]], job: Job, folder: Path) -> dict[str, Any]:
-    """Run one search in a process apart; while it runs, a file has its progress in percent."""
+def _noted(job: Job, folder: Path) -> dict[str, Any]:
+    """Run one search in a process apart; while it runs, a file has its progress in percent and its best attack so far."""
     note = _note(job, folder)
 
-    def tell(done: int, total: int, *_: object) -> None:
+    def tell(done: int, total: int, text: str, mean: float) -> None:
         with contextlib.suppress(InputError):  # progress is worth no search: the folder may be on another machine
-            write_atomic(note, b"%d" % (100 * done // total))
+            held = 100 * done // total, f", {job.arena.scenario}, dose {job.arena.dose}: {text}"
+            write_atomic(note, json.dumps(held).encode())
 
     try:
-        return one(job, folder, tell)
+        return search(job, folder, tell)
     finally:
         with contextlib.suppress(OSError):
             note.unlink()
 
 
 @contextlib.contextmanager
-def _followed(notes: Sequence[Path], update: Callable[[int], None]) -> Iterator[None]:
-    """Read these files every few seconds within the block, and call update(sum of their percents)."""
+def _followed(notes: Sequence[Path], update: Callable[[int, str], None]) -> Iterator[None]:
+    """Read these files every few seconds within the block, and call update(sum of their percents, each one's text in turn)."""
     over = threading.Event()
 
     def follow() -> None:
+        turn = 0
         while not over.wait(PAUSE):
-            held = []
+            held, turn = [], turn + 1
             for note in notes:
                 with contextlib.suppress(OSError, ValueError):  # none yet, or finished in between
-                    held.append(int(note.read_bytes()))
-            update(sum(held))
+                    held.append(load_json(note))
+            update(sum(percent for percent, _ in held), held[turn % len(held)][1] if held else "")
 
     thread = threading.Thread(target=follow, daemon=True)
     thread.start()

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import os
-from collections.abc import Iterator, Sequence
-from contextvars import ContextVar
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -16,28 +13,13 @@ import numpy as np
 from tailgate.core import Array, Estimate, Model, Prior, Received
 from tailgate.core.draws import Draws
 from tailgate.core.loop import check_estimate
+from tailgate.core.veil import secret
 from tailgate.sandbox.limits import Limits
 from tailgate.sandbox.process import Process
 from tailgate.sandbox.sandbox import Sandbox
 from tailgate.sandbox.wire import Outputs, model_arrays
 
-_veil: ContextVar[bytes] = ContextVar("veil", default=b"")  # a secret of this training; empty outside training
 _AHEAD = 50  # steps per grant of processor time
-
-
-@contextlib.contextmanager
-def veiled() -> Iterator[None]:
-    """Hide from isolated defences, within the block, which episode is played and that an attacker is trained.
-
-    Training seeds are small numbers, and episodes are counted.
-    A class that recognised them could be weak in training and strong where it is scored.
-    The keys of its draws are therefore hashed with a secret, which is new each time.
-    """
-    token = _veil.set(os.urandom(32))
-    try:
-        yield
-    finally:
-        _veil.reset(token)
 
 
 class Veiled(NamedTuple):
@@ -144,7 +126,7 @@ class Isolated:
 
 def _shown(plan: IsolatedPlan, draws: Draws) -> tuple[Array, Array]:
     """Return the key and number of each episode (B,), as the process may know them."""
-    veil = _veil.get()
+    veil = secret()
     if not veil:
         return draws.key, draws.episode
     held = plan.veiled
@@ -153,7 +135,7 @@ def _shown(plan: IsolatedPlan, draws: Draws) -> tuple[Array, Array]:
     else:
         stale, shown = (held.key != draws.key) | (held.episode != draws.episode), held.shown.copy()
     for i in np.flatnonzero(stale):
-        digest = hashlib.blake2b(f"{int(draws.key[i])}/{int(draws.episode[i])}".encode(), key=veil, digest_size=8).digest()
+        digest = hashlib.blake2b(f"{i}/{int(draws.key[i])}/{int(draws.episode[i])}".encode(), key=veil, digest_size=8).digest()
         shown[i] = int.from_bytes(digest, "little")
     plan.veiled = Veiled(draws.key.copy(), draws.episode.copy(), shown, veil)
     return shown, np.zeros_like(draws.episode)

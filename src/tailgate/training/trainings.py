@@ -125,7 +125,7 @@ def _apart(defence: str) -> contextlib.AbstractContextManager[None]:
     """Hide from a defence in a sandbox, within a block, whether the keys that it draws with are of training or of scoring."""
     if Spec("defence", defence).sandboxed is None:
         return contextlib.nullcontext()
-    from tailgate.sandbox.isolated import veiled
+    from tailgate.core.veil import veiled
 
     return veiled()
 
