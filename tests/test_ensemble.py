@@ -208,6 +208,13 @@ def test_starts(monkeypatch):
     assert [start.name for start in starts_of(place, "black", [script], 0, names[3:5])[:2]] == names[3:5]
 
 
+def test_a_network_of_many_wires_sees_fewer_steps():
+    """Weights of a layer of more than LARGE numbers would be constants of the program, and nothing would be learned."""
+    codec, deep = SimpleNamespace(size=91), SimpleNamespace(names=("one",) * 384)  # network-restless-v0, wire by wire
+    assert networks._small(networks.FORMS, codec, deep) == [networks.Form(1, 16), networks.Form(2, 0)]
+    assert networks._small(networks.FORMS, SimpleNamespace(size=7), deep) == list(networks.FORMS)
+
+
 @pytest.mark.long
 def test_a_published_start_keeps_its_kinds(tmp_path):
     """A published policy that learned with fewer kinds than are granted goes on with its own, and its file says so."""

@@ -26,6 +26,7 @@ from tailgate.core.kinds import Kind
 from tailgate.core.loop import Loop
 from tailgate.core.neural import Network
 from tailgate.core.registry import Spec
+from tailgate.engine.parameters import LARGE
 from tailgate.ensemble.evolution import JUDGED, SHORTER, ZOO, Evolution, Start
 from tailgate.ensemble.search import Arena, Tell
 from tailgate.envs.gym.actions import ActionCodec, ActionSpec
@@ -156,7 +157,7 @@ def _drawn(
 
     out, first = [], action.delay if Kind.ECHO_DELAY in codec.carried else action.value
     moved = f", a ramp from {first:.4g} by {action.rate:.4g}" if action.action == "ramp" else ""
-    for form, script in itertools.product(forms, ("", *scripts)):
+    for form, script in itertools.product(_small(forms, codec, deep), ("", *scripts)):
         name = f"{f'as {script}' if script else 'rest'} ({form}{moved})"
         if only and name not in only:
             continue
@@ -173,6 +174,12 @@ def _drawn(
         weights, biases = zip(*((weight.copy(), bias.copy()) for weight, bias in shape.layers(theta)), strict=True)
         out.append(Start(name, PolicyPlan(Network(weights, biases), codec, seen), size, script))
     return out
+
+
+def _small(forms: Sequence[Form], codec: ActionCodec, deep: ObservationCodec) -> list[Form]:
+    """Return the forms with as many frames as one layer of LARGE weights can read: weights of a larger layer are constants of a program."""
+    each = len(deep.names) // SEEN
+    return [form._replace(frames=frames) for form in forms if (frames := min(form.frames, LARGE // (each * (form.hidden or codec.size))))]
 
 
 def starts_of(arena: Arena, knowledge: str, scripts: Sequence[str], seed: int, only: Sequence[str] = ()) -> list[Start]:
