@@ -1,9 +1,10 @@
 """Measures what falsification and splitting find, against plain episodes.
 
-    python benchmarks/results/falsification/falsification.py [--episodes 1000000] [--repeats 100] [--out FILE]
+    python benchmarks/results/falsification/falsification.py [--part NAME ...] [--episodes 1000000] [--repeats 100] [--out FILE]
 
-A fault is planted in a filter (planted.py). Random episodes without an attack do not show it; a search does, and its attack is shrunk. The
-rare event is an AR(1) process that crosses a level: its probability is known from an integral.
+A fault is planted in a filter (planted.py). Random episodes without an attack do not show it; a search does, and its attack is shrunk.
+Random attacks are played under four threat models, next to searches. The rare event is an AR(1) process that crosses a level: its
+probability is known from an integral. Parts that are not asked for stay as they are in the file.
 """
 
 import dataclasses
@@ -16,13 +17,14 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm
 
+from tailgate.base.reading import load_json
 from tailgate.bench.study import arguments, made_by, write_record
 from tailgate.core import draws
 from tailgate.core.draws import Draws
 from tailgate.core.registry import Spec
 from tailgate.falsify.case import Case
 from tailgate.falsify.run import falsify
-from tailgate.falsify.search import Search, search
+from tailgate.falsify.search import EPISODES, GENERATION, Search, search
 from tailgate.falsify.splitting import chance_of, plain_episodes, split
 from tailgate.play.trace import rollout
 
@@ -30,9 +32,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 BIASED = (("kinds", ["fdi"]), ("targets", ["position"]), ("fdi_bound", 60))
 FAULT = Case("", "stop-and-go-v0", 60, "planted:SignError", BIASED, "G[0,60] gap_error < 80")
 TRIALS, SEEDS = 128, 5
+LIMITS, DRAWN, TRIED = ((60, 60), (16, 10), (13, 10), (14, 6)), 1024, 512  # bound [m] and dose; random scripts; trials of a search
 AT_ONCE = 2000
 KEEP, STEPS, LEVEL = 0.9, 50, 12.2
 PARTICLES, RUNS = 500, 10
+LIBRARIES = "numpy", "scipy", "optuna", "cmaes"
 
 
 def random_episodes(episodes: int) -> dict[str, Any]:
@@ -62,6 +66,24 @@ def searches() -> list[dict[str, Any]]:
                 "sound_least": round(sound.robustness, 3),
             })  # fmt: skip
             print(out[-1])
+    return out
+
+
+def attacks() -> list[dict[str, Any]]:
+    """Random scripts, and a search of half as many, under several threat models: the episodes in which each shows the fault."""
+    out = []
+    for bound, dose in LIMITS:
+        case = dataclasses.replace(FAULT, dose=dose, threat=(*BIASED[:2], ("fdi_bound", bound)))
+        rng, broken = np.random.default_rng(0), 0
+        for first in range(0, DRAWN, GENERATION):
+            seeds = np.arange(first, first + GENERATION)[:, None] * EPISODES + np.arange(EPISODES)
+            broken += int((case.robustness(rng.random((GENERATION, len(case.genes))), seeds) < 0.0).sum())
+        found = search(Search(case, "tpe", TRIED, 0))
+        out.append({
+            "bound": bound, "dose": dose, "random": {"episodes": DRAWN * EPISODES, "violations": broken},
+            "tpe": {"episodes": TRIED * EPISODES, "violations": found.violations, "least": round(found.robustness, 3)},
+        })  # fmt: skip
+        print(out[-1])
     return out
 
 
@@ -109,11 +131,18 @@ def main() -> None:
     parser = arguments(__file__, __doc__)
     parser.add_argument("--episodes", type=int, default=1_000_000)
     parser.add_argument("--repeats", type=int, default=100)
+    makers = {
+        "rare": lambda: rare(options.repeats), "searches": searches,
+        "random": lambda: random_episodes(options.episodes), "attacks": attacks,
+    }  # fmt: skip
+    parser.add_argument("--part", action="append", choices=list(makers), help="only this part (repeatable; default: all)")
     options = parser.parse_args()
-    found = {"rare": rare(options.repeats), "searches": searches(), "random": random_episodes(options.episodes)}
+    held = load_json(options.out) if options.part and options.out.is_file() else {}
+    found = {name: make() if name in (options.part or makers) else held.get(name) for name, make in makers.items()}
     print(found["rare"], found["random"], sep="\n")
-    case = {"scenario": FAULT.scenario, "dose": FAULT.dose, "property": FAULT.formula, "threat": dict(BIASED)}
-    write_record(options.out, made_by("numpy", "scipy", "optuna", "cmaes") | {"case": case} | found)
+    case, made = {"scenario": FAULT.scenario, "dose": FAULT.dose, "property": FAULT.formula, "threat": dict(BIASED)}, made_by(*LIBRARIES)
+    later = held.get("parts", {}) | {name: made for name in options.part or ()}
+    write_record(options.out, (held or made) | {"case": case, "parts": later} | found)
 
 
 if __name__ == "__main__":

@@ -277,5 +277,8 @@ def hindsight(arena: Arena, start: Schedule, episodes: int, rounds: int, purpose
 
 
 def gradient_masking(white: Found | None, black: Found | None) -> bool:
-    """Return True if the best script, a black box, did more damage than the gradients: the defence hides its derivatives."""
+    """Return True if the best black box of any kind damaged more select episodes than the gradients, which send false data alone.
+
+    It is a hint that the defence hides its derivatives, and no test: the kinds of attack may differ too.
+    """
     return black is not None and (white is None or white.damage < black.damage)
