@@ -1,7 +1,7 @@
 # ruff: noqa: E501 - tables
-"""Real roads: the fit, false alarms on recordings, the time gap, and the order of defences on made-up and on recorded roads.
+"""Real roads: the fit, false alarms on recordings, the time gap, and the order of defences on made-up and recorded roads and by time gap.
 
-    python benchmarks/roads.py [--out results/roads-v0] [--parts fit,alarms,order,boards,gaps,aeb,speed] [--episodes 100]
+    python benchmarks/roads.py [--out results/roads-v0] [--parts fit,alarms,order,headway,boards,gaps,aeb,speed] [--episodes 100]
 
 Each part writes PART.json into the folder, and a figure into docs/images with --figures. A part that has its file is not played again.
 """
@@ -39,7 +39,7 @@ DEFENCES = ("none", "kf", "rkf", "imm", "chi2_kf", "chi2_kf_sparse", "windowed_c
             "cusum_reacquire_kf", "widen_kf", "brake_kf")  # fmt: skip
 DETECTORS = ("chi2_kf", "chi2_kf_sparse", "windowed_chi2_kf", "cusum_kf", "mewma_kf", "rkf", "imm")
 RECORDINGS = (("asta-string", "asta-braking"), ("comma2k19-radar",))  # of one rate each
-RESAMPLES = 2000
+RESAMPLES, GAPS = 2000, (1.2, 3.0)  # time gaps [s] of the comparison with all else equal
 
 
 def crashed(scenario: Scenario, defence: str, attack: str, dose: int, episodes: int) -> np.ndarray | None:
@@ -137,20 +137,56 @@ def summary(harm: dict[str, Any]) -> dict[str, Any]:
     base = {name: scores(doses) for name, doses in harm.items()}
     out: dict[str, Any] = {"scores": base, "correlation": {}}
     for one, two in (("synthetic", "road"), ("synthetic", "string"), ("road", "string")):
-        names = list(base[one])
-        rng, drawn = np.random.default_rng(0), []
-        for _ in range(RESAMPLES):
-            a, b = scores(harm[one], rng), scores(harm[two], rng)
-            some = [names[i] for i in rng.integers(0, len(names), len(names))]
-            x, y = ([part[name] for name in some] for part in (a, b))
-            if len(set(x)) > 1 and len(set(y)) > 1:
-                drawn.append((spearmanr(x, y).statistic, kendalltau(x, y).statistic))
-        x, y = ([base[part][name] for name in names] for part in (one, two))
-        low, high = np.quantile(np.array(drawn), [0.025, 0.975], axis=0)
-        out["correlation"][f"{one}, {two}"] = {
-            "defences": len(names), "spearman": float(spearmanr(x, y).statistic), "spearman_interval": [float(low[0]), float(high[0])],
-            "kendall": float(kendalltau(x, y).statistic), "kendall_interval": [float(low[1]), float(high[1])],
-        }  # fmt: skip
+        out["correlation"][f"{one}, {two}"] = correlation(harm[one], harm[two])
+    return out
+
+
+def correlation(one: dict[str, Any], two: dict[str, Any]) -> dict[str, Any]:
+    """Rank correlations of the scores in two places, with intervals: over defences and episodes, both resampled."""
+    base = scores(one), scores(two)
+    names = list(base[0])
+    rng, drawn = np.random.default_rng(0), []
+    for _ in range(RESAMPLES):
+        a, b = scores(one, rng), scores(two, rng)
+        some = [names[i] for i in rng.integers(0, len(names), len(names))]
+        x, y = ([part[name] for name in some] for part in (a, b))
+        if len(set(x)) > 1 and len(set(y)) > 1:
+            drawn.append((spearmanr(x, y).statistic, kendalltau(x, y).statistic))
+    x, y = ([part[name] for name in names] for part in base)
+    low, high = np.quantile(np.array(drawn), [0.025, 0.975], axis=0)
+    return {
+        "defences": len(names), "spearman": float(spearmanr(x, y).statistic), "spearman_interval": [float(low[0]), float(high[0])],
+        "kendall": float(kendalltau(x, y).statistic), "kendall_interval": [float(low[1]), float(high[1])],
+    }  # fmt: skip
+
+
+def at_gap(gap: float) -> tuple[Scenario, list[str]]:
+    """The car of road-v0 at another time gap [s], and the black-box scripts of the suite; a trigger at a gap moves with it."""
+    base, threshold = load_scenario("road-following-v0"), f"threshold={round(3.5 + 19.0 * gap)}"  # the median gap, as 25 m is at 1.2 s
+    scripts = [text for text in load_suite("road-v0").attacks if Spec("attack", text).entry.knowledge == "black"]
+    place = dataclasses.replace(base, controller=dataclasses.replace(base.controller, headway=gap), plant=dataclasses.replace(base.plant, time_gap=gap))
+    return place, [text.replace("threshold=25", threshold) for text in scripts]
+
+
+def part_headway(options: argparse.Namespace) -> dict[str, Any]:
+    """The order of the defences at 1.2 and at 3 s: same car, sensor, leaders, and kinds and sizes of attacks. By blocks of the recording too."""
+    harm = {}
+    for gap in GAPS:
+        place, attacks = at_gap(gap)
+        harm[gap] = {str(dose): harms(place, attacks, dose, options.episodes) for dose in load_suite("road-v0").doses}
+    out: dict[str, Any] = {"scores": {f"{gap:g}": scores(held) for gap, held in harm.items()}, "correlation": correlation(*harm.values())}
+    loop = place.loop(Spec("defence", "kf").make(), ())
+    begun = loop.start(draws.keys("report", range(options.episodes))).manoeuvre.at
+    joined = [block for block in place.manoeuvre.blocks(place.plant.dt)[1] if block.purpose == "report"]
+    out["blocks"] = []
+    for block in joined:
+        mine = np.flatnonzero((begun >= block.first) & (begun < block.last))
+        parts = [
+            {dose: {defence: {attack: "".join(hits[i] for i in mine) for attack, hits in attacks.items()} for defence, attacks in held.items()} for dose, held in doses.items()}
+            for doses in harm.values()
+        ]  # fmt: skip
+        found = correlation(*parts)
+        out["blocks"].append({"episodes": len(mine), "spearman": found["spearman"], "scores": {f"{gap:g}": scores(part) for gap, part in zip(GAPS, parts, strict=True)}})
     return out
 
 
@@ -178,12 +214,8 @@ def part_boards(options: argparse.Namespace) -> dict[str, Any]:
 def part_gaps(options: argparse.Namespace) -> dict[str, Any]:
     """Collisions by time gap: the car of road-v0 at 0.8 to 3 s, under the worst script of the suite at each dose."""
     suite, out = load_suite("road-v0"), {}
-    base = load_scenario("road-following-v0")
-    mine = [text for text in suite.attacks if Spec("attack", text).entry.knowledge == "black"]
     for gap in (0.8, 1.2, 2.0, 3.0):
-        threshold = f"threshold={round(3.5 + 19.0 * gap)}"  # the median gap, as 25 m is at 1.2 s
-        attacks = [text.replace("threshold=25", threshold) for text in mine]
-        place = dataclasses.replace(base, controller=dataclasses.replace(base.controller, headway=gap), plant=dataclasses.replace(base.plant, time_gap=gap))
+        place, attacks = at_gap(gap)
         out[f"{gap:g}"] = {str(dose): {
             defence: 1.0 - share for defence, share in undamaged(harms(place, attacks, dose, options.episodes, ("kf", "chi2_kf", "cusum_kf", "rkf"))).items()
         } for dose in suite.doses}  # fmt: skip
@@ -227,7 +259,7 @@ def part_speed(options: argparse.Namespace) -> dict[str, Any]:
     return out
 
 
-PARTS = {"fit": part_fit, "alarms": part_alarms, "order": part_order, "boards": part_boards, "gaps": part_gaps, "aeb": part_aeb, "speed": part_speed}
+PARTS = {"fit": part_fit, "alarms": part_alarms, "order": part_order, "headway": part_headway, "boards": part_boards, "gaps": part_gaps, "aeb": part_aeb, "speed": part_speed}
 
 
 def draw_order(held: dict[str, Any]) -> bytes:

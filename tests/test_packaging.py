@@ -70,6 +70,15 @@ def test_published_boards_are_of_versions_that_play_the_same() -> None:
     assert {load(path)["suite"]["version"] for path in boards} <= {*ALIKE, CONFIG["project"]["version"]}
 
 
+def test_packaged_boards_and_lists_are_those_of_results() -> None:
+    """A board by name, and the list of attacks that joined its suite."""
+    for path in (ROOT / "configs/boards").iterdir():
+        folder = ROOT / "results" / path.name.partition(".")[0]
+        assert path.read_bytes() == (folder / "board.json.xz").read_bytes(), path
+    for path in (ROOT / "results").glob("*/attacks.jsonl"):
+        assert (ROOT / f"configs/suites/{path.parent.name}.attacks.jsonl").read_bytes() == path.read_bytes(), path
+
+
 def test_no_module_shadows_a_well_known_name() -> None:
     names = {p.name for folder in ("envs", "estimators", "agents", "configs") for p in (ROOT / folder).glob("*.py")}
     assert not names & {"types.py", "gym.py", "typing.py", "random.py", "copy.py", "io.py"}

@@ -1,11 +1,12 @@
 """Learned attacks against searched scripts: the standard ensemble in every cell of record.yaml, with five seeds.
 
-    python results/adversaries-v1/record.py [--seeds 5] [--episodes 2000] [--workers 2] [--out runs/record]
+    python results/adversaries-v1/record.py [--suite NAME ...] [--seeds 5] [--episodes 2000] [--workers 2] [--out runs/record]
 
 In each cell every seed searches anew: scripts, programs and networks, black box. Each seed's best network meets the best script or
 program of all seeds, chosen on select episodes, on fresh report episodes. The champion is the network of all seeds that did best on
 select episodes. A test is McNemar's on the same episodes, one-sided, corrected by Holm over all tests of the record. The same command
-goes on after an interrupt. Writes report.json and report.md next to this file.
+goes on after an interrupt. Writes report.json and report.md next to this file. With --suite the cells of other suites stay as reported;
+the correction is over all.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from tailgate.base.files import write_atomic
 from tailgate.base.locks import alone
 from tailgate.base.pool import each
 from tailgate.base.progress import progress
+from tailgate.base.reading import load_json
 from tailgate.core import Array
 from tailgate.core.scenario import load_suite
 from tailgate.core.schema import read_yaml
@@ -113,6 +115,10 @@ def markdown(cells: list[dict[str, Any]], options: argparse.Namespace) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _cell(line: dict[str, Any]) -> tuple[str, int, str]:
+    return line["scenario"], line["dose"], line["defence"]
+
+
 def _percent(held: dict[str, Any]) -> str:
     share, low, high = (100 * held[name] for name in ("share", "low", "high"))
     return f"{share:.1f} % ({low:.1f} to {high:.1f})"
@@ -121,6 +127,7 @@ def _percent(held: dict[str, Any]) -> str:
 def main() -> None:
     """Search, compare and write the report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--suite", action="append", metavar="NAME", help="only the cells of this suite (repeatable; default: all)")
     parser.add_argument("--seeds", type=int, default=5, help="seeds of the search (default 5)")
     parser.add_argument("--episodes", type=int, default=2000, help="report episodes (default 2000)")
     parser.add_argument("--workers", type=int, default=2, help="processes (default 2); change no result")
@@ -130,7 +137,14 @@ def main() -> None:
     for name in ("seeds", "episodes", "workers"):
         sizes.check(name, getattr(options, name))
     jobs: list[Job] = []
-    for name, cells in read_yaml(HERE / "record.yaml", "record")["suites"].items():
+    suites = read_yaml(HERE / "record.yaml", "record")["suites"]
+    if strange := [name for name in options.suite or () if name not in suites]:
+        raise SystemExit(f"record: --suite: got {strange[0]!r}; expected one of {', '.join(suites)}")
+    order = [(scenario, dose, defence) for cells in suites.values() for scenario, dose, defence in cells]
+    known = {_cell(line): line for line in load_json(options.report / "report.json")} if options.suite else {}
+    for name, cells in suites.items():
+        if options.suite and name not in options.suite:
+            continue
         suite = load_suite(name)
         for scenario, dose, defence in cells:
             arena = Arena(name, scenario, dose, defence, dict(suite.granted), suite.bound, suite.progress)
@@ -143,13 +157,14 @@ def main() -> None:
             write_atomic(files[left[number]], json.dumps(result, indent=1).encode() + b"\n")
             job = jobs[left[number]]
             update("record", done + 1, len(left), f"{job.arena.scenario}, {job.arena.defence}, seed {job.seed}")
-        out = []
         for i in range(0, len(jobs), options.seeds):
             runs = [json.loads(file.read_text()) for file in files[i : i + options.seeds]]
             try:
-                out.append(compared(jobs[i].arena, runs, options.episodes))
+                line = compared(jobs[i].arena, runs, options.episodes)
+                known[_cell(line)] = line
             except NotApplicable as error:
                 print(f"{jobs[i].arena.defence}: {error}")
+    out = [known[cell] for cell in order if cell in known]
     verdicts(out)
     write_atomic(options.report / "report.json", json.dumps(out, indent=1).encode() + b"\n")
     page = markdown(out, options)
