@@ -1,14 +1,17 @@
 """The traced engine: random graphs and array code give the same bits in numpy and in machine code."""
 
+import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from tailgate.engine import objects
 from tailgate.engine.evaluation import evaluate
 from tailgate.engine.graph import Graph, Node
 from tailgate.engine.operations import BOOL, COMPARISONS, DTYPES, FLOAT
-from tailgate.engine.program import Program
+from tailgate.engine.program import Program, _pool
 from tailgate.engine.tracing import Trace
 
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, 1e-310, -5e-324, 1e308, -1e308, np.inf, -np.inf, np.nan, 2.0**63, -(2.0**63), 3.7, 255.5])
@@ -153,3 +156,27 @@ def test_random_graphs(seed: int) -> None:
         program = Program(trace, lanes, least=int(chance.integers(1, 20)))
         for batch, values in zip(batches, (None, others, None, others), strict=True):
             as_numpy(program, uniforms, shapes, batch, values, chance)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+def test_a_forked_process_has_threads_of_its_own() -> None:
+    """It would wait for those of its parent."""
+    assert _pool(1).submit(int).result() == 0
+    if child := os.fork():
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        return
+    try:
+        _pool(1).submit(int).result(timeout=20.0)
+        os._exit(0)
+    finally:
+        os._exit(1)
+
+
+def test_a_user_without_a_home_keeps_no_objects(monkeypatch: pytest.MonkeyPatch) -> None:
+    def home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", home)
+    for name in ("TAILGATE_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    assert objects.folder() is None

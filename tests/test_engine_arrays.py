@@ -96,7 +96,9 @@ CASES: dict[str, Callable[..., Any]] = {
     "reduce": lambda x, y, m, n: np.add.reduce(x, axis=1) * np.logical_or.reduce(m, axis=1) + np.multiply.reduce(x[:, :2], axis=1),
     "makers": lambda x, y, m, n: np.full((len(x), 3), 2.0) + np.ones(x.shape) * np.zeros_like(x) + np.full_like(x, n[:, None]),
     "repeat": lambda x, y, m, n: np.repeat(x[:, :2], 2, axis=1) + np.roll(np.flip(np.concatenate([x, x[:, :1]], 1), 1), 1, axis=1),
-    "casts": lambda x, y, m, n: (x * 1e19).astype(np.int64) + (x * 10).astype(np.int32),
+    "casts": lambda x, y, m, n: (x * 1e19).astype(np.int64) + (x * 10).astype(np.int64).astype(np.int32),
+    "no numbers": lambda x, y, m, n: np.argmax(np.where(m, x, np.nan), axis=1) * 4 + np.argmin(np.where(m, np.nan, x), axis=1),
+    "zeros of a sum": lambda x, y, m, n: 1.0 / np.sum(-0.0 * np.abs(x), axis=1) + 2.0 / np.add.reduce(-0.0 * np.abs(x), axis=1),
     "loops": lambda x, y, m, n: sum(v * k for k, v in enumerate(x.T)),
     "tables": lambda x, y, m, n: num.take(TABLE, n % 30) + num.take(TABLE[:3], n % 3) + num.take(TABLE[:, 0] > 0, n % 30)[:, None],
     "large matrices": lambda x, y, m, n: num.apply(LARGE, np.concatenate([x] * 4, axis=1)[:, None]),
@@ -115,6 +117,33 @@ def arrays(batch: int, seed: int = 3) -> dict[str, np.ndarray]:
     chance = np.random.default_rng(seed)
     x = np.where(chance.random((batch, 3)) < 0.2, 0.0, chance.normal(size=(batch, 3)))
     return {"x": x, "y": chance.normal(size=(batch, 3, 2)), "m": chance.random((batch, 3)) < 0.5, "n": chance.integers(0, 50, batch)}
+
+
+@pytest.mark.parametrize("kind", [np.int32, np.int8, np.uint64, np.uint16])
+def test_a_float_becomes_no_narrow_number(kind: Any) -> None:
+    """Numpy's answer to a number that does not fit depends on the machine."""
+    with pytest.raises(Untraceable, match=r"write x\.astype\(np\.int64\)"):
+        traced(lambda _, held: ((), {"out": held["x"].astype(kind)}), (), {"x": np.ones((1, 3))})
+
+
+def test_code_that_is_compiled_while_another_is_traced() -> None:
+    """The outer code goes on with traced arrays."""
+
+    def step(_: Any, held: Any) -> Any:
+        weight = num.exp(np.arange(4000.0) / 4000.0)  # machine code, from some length on
+        out = np.zeros(held["x"].shape)
+        out[..., 0] = held["x"][..., 0] * weight[3]
+        return (), {"out": out}
+
+    assert next(iter(traced(step, (), {"x": np.ones((1, 3))}).results)) == "out"
+
+
+def test_a_comparison_of_parameters_is_no_number() -> None:
+    def step(_: Any, held: Any) -> Any:
+        eta, size = lifted(held["x"], (2.0, 3))
+        return (), {"out": (eta > 1.0) & (held["x"] > 0.0) & (size + eta > 4.5)}
+
+    assert next(iter(traced(step, (), {"x": np.ones((1, 3))}).results)) == "out"
 
 
 @pytest.mark.parametrize("name", CASES)

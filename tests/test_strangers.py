@@ -8,9 +8,10 @@ import pytest
 
 from tailgate.agents.scripts.scripted import NoAttack
 from tailgate.base.errors import InputError
-from tailgate.core import draws
+from tailgate.core import Command, Kind, draws
 from tailgate.core.scenario import load_scenario
 from tailgate.core.threat import ThreatModel
+from tailgate.engine.parameters import Parameters
 from tailgate.envs.gym.gymnasium_env import AdversaryEnv, AdversaryVectorEnv
 from tailgate.play.metrics import METRICS, UNITS, measure
 from tailgate.play.rollouts import Rollout, rollout_of
@@ -60,6 +61,63 @@ def test_other_numbers_of_a_strangers_classes_are_not_traced_again(monkeypatch):
     fast = Trace(loop.model, loop.horizon, *program.play(keys, True), loop.controller.desired_gap)
     plain = rollout(loop, Nudge(gain=0.9), keys, plain=True)
     assert [fast.trace_hash(row) for row in range(5)] == [plain.trace_hash(row) for row in range(5)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Reads:
+    """An attack whose size is a global, a constant of its class, and what a function that it calls reads."""
+
+    limit = 0.2
+
+    def prepare(self, brief):
+        return brief
+
+    def start(self, plan, batch, draws):
+        return np.zeros(batch)
+
+    def decide(self, plan, memory, view, draws):
+        size = np.minimum(GAIN, self.limit) + _more()
+        target = np.broadcast_to((view.k >= 30)[:, None, None], (len(view.k), *plan.granted.shape)) & plan.granted
+        kind = np.where(target.any(axis=(1, 2)), Kind.FDI.value, 0).astype(np.int8)
+        return memory, Command(kind, target, np.where(target, size, 0.0))
+
+
+def _more():
+    return EXTRA["more"]
+
+
+GAIN, EXTRA = 0.1, {"more": 0.05}
+
+
+@pytest.mark.parametrize("change", ["nothing", "global", "class", "dict"])
+def test_what_a_strangers_code_reads_may_change(monkeypatch, change):
+    """A program that was made with other numbers is not used."""
+    loop, keys = _loop(), draws.keys("report", range(5))
+    assert isinstance(first := rollout_of(loop, Reads()), Rollout), first
+    if change == "global":
+        monkeypatch.setitem(globals(), "GAIN", 0.15)
+    if change == "class":
+        monkeypatch.setattr(Reads, "limit", 0.07)
+    if change == "dict":
+        monkeypatch.setitem(EXTRA, "more", 0.01)
+    program = rollout_of(loop, Reads())
+    fast = Trace(loop.model, loop.horizon, *program.play(keys, True), loop.controller.desired_gap)
+    plain = rollout(loop, Reads(), keys, plain=True)
+    assert [fast.trace_hash(row) for row in range(5)] == [plain.trace_hash(row) for row in range(5)]
+    assert (program.program is first.program) == (change == "nothing")
+
+
+def test_bits_and_defaults_are_part_of_a_key():
+    def made(gain, other):
+        def law(x, gain=gain, *, other=other):
+            return x * gain + other
+
+        return law
+
+    keys = [Parameters((made(*pair), number)).key for pair, number in (((1.0, 2.0), np.float64(0.0)), ((1.0, 2.0), np.float64(-0.0)))]
+    assert keys[0] != keys[1]
+    first, second = (Parameters(made(*pair)) for pair in ((1.0, 2.0), (3.0, 4.0)))
+    assert np.concatenate(first.values).tolist() == [1.0, 2.0] and np.concatenate(second.values).tolist() == [3.0, 4.0]
 
 
 def test_a_reward(tmp_path):

@@ -154,7 +154,7 @@ class Hand:
         state, estimate = defence.step(plan, state, received, known_u, draws)
         for i, knob in enumerate(self.knobs):
             if knob.name == "mode":
-                asked = np.where(estimate.mode != Mode.NORMAL, values[:, i, None], float(Mode.NORMAL)).astype(np.int8)
+                asked = np.where(estimate.mode != Mode.NORMAL, values[:, i, None], float(Mode.NORMAL)).astype(np.int64).astype(np.int8)
                 estimate = estimate._replace(mode=asked)
         return state, estimate
 

@@ -163,6 +163,8 @@ class Traced(_Base):
     def astype(self, dtype: DTypeLike, order: str = "K", casting: str = "unsafe", copy: bool = True) -> Traced:
         """Convert to another type."""
         to = np.dtype(dtype)
+        if self.dtype.kind == "f" and not self.fixed and (to.kind == "u" or (to.kind == "i" and to.itemsize < 8)):
+            raise Untraceable(f"a float as {to}", "write x.astype(np.int64): numpy's answer to other types depends on the machine")
         return self.copy() if to == self.dtype else self.mapped(lambda node: self.graph.cast(node, to), to)
 
     def mapped(self, function: Callable[[Node], Node], dtype: DTypeLike | None = None) -> Traced:
@@ -319,7 +321,8 @@ def _of_all(graph: Graph, nodes: Array, arrays: Sequence[Traced], dtype: np.dtyp
     back = shared_batch(arrays)
     if back is not None and nodes.shape[back] != 1:
         raise Untraceable("the axis of the episodes against a longer one", "give each array the episodes as its first axis")
-    weak = next(iter({a.weak for a in arrays}), None) if all(a.weak for a in arrays) else None
+    kinds = {a.weak for a in arrays}
+    weak = None if None in kinds or dtype == BOOL else max(kinds, key=(bool, int, float).index, default=None)
     return Traced(graph, nodes, dtype, None if back is None else nodes.ndim + back, weak)
 
 
@@ -384,6 +387,9 @@ def reduced(x: Traced, op: str, axis: Axis, keepdims: bool, instead: str = "name
     if keepdims:
         for a in axes_of(x, axis, instead):
             out = out._moved(lambda n, a=a: np.expand_dims(n, a))
+    if op == "add" and x.dtype.kind == "f":
+        zero = x.graph.const(0.0, x.dtype)
+        out = out.mapped(lambda node: x.graph.binary("add", node, zero))  # numpy begins with 0.0: no sum is -0.0
     return out[()] if out.ndim else out
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from tailgate.engine.array import Traced, chosen, each, lifted, result_type, shared_batch, typed
 from tailgate.engine.buffers import boxed, swept, wide
 from tailgate.engine.graph import Graph, Node
-from tailgate.engine.operations import Array, ArrayLike, Axis, DTypeLike, Shape
+from tailgate.engine.operations import FLOAT, Array, ArrayLike, Axis, DTypeLike, Shape
 from tailgate.engine.untraceable import Untraceable
 
 
@@ -94,17 +94,24 @@ def _likes(value: ArrayLike) -> Callable[..., Traced]:
 
 
 def _least(x: Traced, axis: int, op: str) -> Traced:
-    """Return the index of the smallest or largest number along an axis, the first of several."""
+    """Return the index of the smallest or largest number along an axis, the first of several; or of the first NaN."""
     if axis is None or (x.batch is not None and axis % x.ndim == x.batch):
         raise Untraceable("the place of one number of all episodes", "name another axis")
     graph, parts = x.graph, [np.take(x.nodes, i, axis) for i in range(x.shape[axis])]
     best, place = parts[0], each(graph, lambda node: graph.const(0, np.dtype(np.int64)), parts[0])
     for i, part in enumerate(parts[1:], 1):
-        better = each(graph, lambda p, b: graph.binary(op, p, b), part, best)
+        better = each(graph, lambda p, b: _wins(graph, op, p, b), part, best)
         best = each(graph, graph.select, better, part, best)
         place = each(graph, lambda c, k, i=i: graph.select(c, graph.const(i, np.dtype(np.int64)), k), better, place)
     shadow = x._moved(lambda n: n.take(0, axis))
     return Traced(graph, place, np.dtype(np.int64), shadow.batch)
+
+
+def _wins(graph: Graph, op: str, p: Node, b: Node) -> Node:
+    better = graph.binary(op, p, b)
+    if p.dtype != FLOAT:
+        return better
+    return graph.binary("or", better, graph.binary("and", graph.binary("ne", p, p), graph.binary("eq", b, b)))
 
 
 def _count_nonzero(x: Traced, axis: Axis = None, keepdims: bool = False) -> Traced:
@@ -296,13 +303,14 @@ def makers(graph: Graph) -> Iterator[None]:
         return maker
 
     with _lock:
+        outer = getattr(_here, "graph", None)
         before, _here.graph = {name: getattr(np, name) for name in _makers(graph)}, graph
         try:
             for name, mine in _makers(graph).items():
                 setattr(np, name, wrapped(before[name], mine, name in _CONVERT))
             yield
         finally:
-            _here.graph = None
+            _here.graph = outer
             for name, original in before.items():
                 setattr(np, name, original)
 

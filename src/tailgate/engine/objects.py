@@ -63,9 +63,9 @@ def _machine() -> Any:
 
 def folder() -> Path | None:
     """Return the folder of objects: TAILGATE_CACHE, or below the user's cache; None if others may write to it."""
-    base = os.environ.get("TAILGATE_CACHE") or os.path.join(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "tailgate")
-    place = Path(base) / "objects"
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError, RuntimeError):  # RuntimeError: this user has no home
+        base = os.environ.get("TAILGATE_CACHE") or os.path.join(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "tailgate")
+        place = Path(base) / "objects"
         place.mkdir(parents=True, exist_ok=True, mode=0o700)
         found = place.stat()
         if not hasattr(os, "getuid") or (found.st_uid == os.getuid() and not found.st_mode & 0o022):

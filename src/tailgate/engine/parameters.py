@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import enum
+import functools
 import hashlib
 import sys
 import types
@@ -136,7 +137,7 @@ class _Reader:
             (node,) = self._leaf(leaf)
             return held if self.graph is None else Traced(self.graph, boxed(node), leaf.dtype, None, type(held))
         if isinstance(held, _PLAIN):
-            self.key += [type(held), id(held) if isinstance(held, (type, types.BuiltinFunctionType, np.ufunc)) else held]
+            self.key += [type(held), _named(held)]
             return held
         if id(held) in self._known:
             number, _, out = self._known[id(held)]
@@ -198,15 +199,15 @@ class _Reader:
 
     def _function(self, held: types.FunctionType) -> Any:
         self.kept.append(held)
-        self.key += [held.__code__, id(held.__globals__)]
+        self.key += [held.__code__, id(held.__globals__), read_by(held)]
         self.modules.add(str(held.__module__))
-        defaults = self.visit(held.__defaults__)
+        defaults, named = self.visit(held.__defaults__), self.visit(held.__kwdefaults__)
         parts = [self.visit(cell.cell_contents) for cell in held.__closure__ or ()]
-        if self.graph is None or not parts:
+        if self.graph is None or not (parts or defaults or named):
             return held
         cells = tuple(types.CellType(part) for part in parts)
-        out = types.FunctionType(held.__code__, held.__globals__, held.__name__, defaults, cells)
-        out.__kwdefaults__ = held.__kwdefaults__
+        out = types.FunctionType(held.__code__, held.__globals__, held.__name__, defaults, cells or None)
+        out.__kwdefaults__ = named
         return out
 
 
@@ -214,6 +215,86 @@ def _frozen(kind: type[Any]) -> bool:
     return bool(kind.__dataclass_params__.frozen)
 
 
+class _Same:
+    """An object as part of a key: equal to itself alone, and alive as long as the key."""
+
+    def __init__(self, held: object) -> None:
+        self.held = held
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.held is other.held
+
+    def __hash__(self) -> int:
+        return id(self.held)
+
+
+def _named(held: object) -> Any:
+    """Return a part of a key that stands for a plain object; numbers of numpy by their bits."""
+    if isinstance(held, np.generic):
+        return held.dtype.str, held.tobytes()
+    return id(held) if isinstance(held, (type, types.BuiltinFunctionType, np.ufunc)) else held
+
+
 def _code_of(kind: type) -> tuple[Any, ...]:
-    """Return the functions of a class and its bases, which may be replaced at run time."""
-    return tuple(part for base in kind.__mro__ for part in vars(base).values() if isinstance(part, types.FunctionType))
+    """Return the functions of a class and its bases, which may be replaced at run time; of somebody else's class all that these read."""
+    functions = tuple(part for base in kind.__mro__ for part in vars(base).values() if isinstance(part, types.FunctionType))
+    return functions + tuple(_values_of(base, set()) for base in kind.__mro__ if _editable(base.__module__))
+
+
+def read_by(function: types.FunctionType) -> tuple[Any, ...]:
+    """Return the globals and defaults that somebody else's function reads, and so on: they may change while the process runs."""
+    return _read(function, set()) if _editable(str(function.__module__)) else ()
+
+
+@functools.cache
+def _editable(module: str) -> bool:
+    """Return True for a module that is neither Tailgate's nor installed: a script, a notebook, a file of somebody's."""
+    top, file = module.partition(".")[0], getattr(sys.modules.get(module), "__file__", None)
+    if top in ("tailgate", "builtins") or (top in sys.stdlib_module_names and module != "__main__"):
+        return False
+    return file is None or not {"site-packages", "dist-packages"} & set(Path(file).parts)
+
+
+def _read(function: types.FunctionType, seen: set[int]) -> tuple[Any, ...]:
+    if id(function) in seen:
+        return ()
+    seen.add(id(function))
+    codes, names = [function.__code__], list[str]()
+    for code in codes:
+        names += code.co_names
+        codes += [part for part in code.co_consts if isinstance(part, types.CodeType)]
+    held = [(name, function.__globals__[name]) for name in dict.fromkeys(names) if name in function.__globals__]
+    given = [*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values()]
+    return function.__code__, *((name, _value(value, seen)) for name, value in held), *(_value(value, seen) for value in given)
+
+
+def _values_of(kind: type, seen: set[int]) -> tuple[Any, ...]:
+    """Return what the attributes of a class hold."""
+    if id(kind) in seen:
+        return ()
+    seen.add(id(kind))
+    return tuple((name, _value(part, seen)) for name, part in vars(kind).items() if not (name.startswith("__") and name.endswith("__")))
+
+
+def _value(held: object, seen: set[int]) -> Any:
+    """Return a part of a key for something that code reads by name."""
+    if isinstance(held, (staticmethod, classmethod)):
+        held = held.__func__
+    if isinstance(held, property):
+        return tuple(_value(part, seen) for part in (held.fget, held.fset) if part is not None)
+    if isinstance(held, functools.cached_property):
+        held = held.func
+    if isinstance(held, types.FunctionType):
+        return _read(held, seen) if _editable(str(held.__module__)) else held.__code__
+    if isinstance(held, type):
+        return _values_of(held, seen) if _editable(held.__module__) else _Same(held)
+    if isinstance(held, (tuple, list)):
+        return type(held), *(_value(part, seen) for part in held)
+    if isinstance(held, dict):
+        return tuple((repr(key), _value(part, seen)) for key, part in held.items())
+    if isinstance(held, np.ndarray) and held.dtype != object:
+        return held.shape, held.dtype.str, held.tobytes()
+    if isinstance(held, _PLAIN) or type(held) is float:
+        return type(held), repr(held) if isinstance(held, (float, complex)) else _named(held)
+    return _Same(held)
+
