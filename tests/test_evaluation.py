@@ -22,6 +22,7 @@ from tailgate.estimators import Kalman, Oracle
 from tailgate.evaluation import cells as evaluation
 from tailgate.evaluation import rows as rows_module
 from tailgate.evaluation.cells import Cell, cells_of, run, run_cell
+from tailgate.evaluation.resume import complete
 from tailgate.evaluation.rows import read_rows
 from tailgate.evaluation.summary import summarise
 from tailgate.play import trace
@@ -377,3 +378,16 @@ def test_the_error_texts_of_the_documentation_are_those_that_come(scenario: str,
     with pytest.raises(InputError) as caught:
         tailgate.make_attack(attack).prepare(place.loop(tailgate.make_defence(defence)).brief)
     assert f"\n{caught.value}\n" in SCENARIOS
+
+
+def test_rows_of_another_cell_end_a_run(tmp_path):
+    """A process with another version of somebody's class would make them; nothing of them is kept."""
+    row = {"cell": "old", "seed": 0, "status": "ok", "defence": "mine:Mine"}
+    out = tmp_path / "rows.jsonl"
+    with pytest.raises(InputError, match="row of mine:Mine: got 'cell old, seed 0'; expected cell new, seed 0: all processes with the same files"):
+        complete(["new"], {"new": [("new", 0)]}, out, lambda _: iter_of((0, [row])), None)
+    assert not out.exists() and not list(tmp_path.glob("**/new*"))
+
+
+def iter_of(*held):
+    yield from held

@@ -229,7 +229,7 @@ class _Same:
 
 
 def _named(held: object) -> Any:
-    """Return a part of a key that stands for a plain object; numbers of numpy by their bits."""
+    """Return a part of a key of a plain object; numbers of numpy by their bits."""
     if isinstance(held, np.generic):
         return held.dtype.str, held.tobytes()
     return id(held) if isinstance(held, (type, types.BuiltinFunctionType, np.ufunc)) else held

@@ -30,6 +30,11 @@ def complete(
     pieces : cell and seed of each row, by name
     play : plays the parts with these indices; yields (position in the indices, rows) as they finish
     progress : called with the numbers of finished and of all parts
+
+    Raises
+    ------
+    InputError
+        For rows of another cell or seed: a component was changed while it played, or another process has another version of it.
     """
     with contextlib.nullcontext() if out is None else Parts(out) as parts:
         done = {} if parts is None else parts.finished(pieces)
@@ -37,6 +42,7 @@ def complete(
         with contextlib.closing(play(missing)) as played:
             for position, rows in played:
                 name = names[missing[position]]
+                _check(rows, pieces[name])
                 done[name] = rows
                 if parts is not None:
                     parts.put(name, rows)
@@ -46,6 +52,14 @@ def complete(
         if parts is not None:
             parts.finish(rows, pieces)
     return rows
+
+
+def _check(rows: Rows, wanted: Wanted) -> None:
+    """Raise InputError for rows that are not those of their cell and seeds."""
+    for row, (cell, seed) in zip(rows, wanted, strict=True):
+        if (row.get("cell"), row["seed"]) != (cell, seed):
+            found = f"cell {row.get('cell')}, seed {row['seed']}"
+            raise InputError(f"row of {row.get('defence')}", found, f"cell {cell}, seed {seed}: all processes with the same files")
 
 
 class Parts:
