@@ -100,6 +100,7 @@ def test_what_a_strangers_code_reads_may_change(monkeypatch, change):
         monkeypatch.setattr(Reads, "limit", 0.07)
     if change == "dict":
         monkeypatch.setitem(EXTRA, "more", 0.01)
+        monkeypatch.setitem(EXTRA, "itself", EXTRA)
     program = rollout_of(loop, Reads())
     fast = Trace(loop.model, loop.horizon, *program.play(keys, True), loop.controller.desired_gap)
     plain = rollout(loop, Reads(), keys, plain=True)

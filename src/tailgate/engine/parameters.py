@@ -288,10 +288,12 @@ def _value(held: object, seen: set[int]) -> Any:
         return _read(held, seen) if _editable(str(held.__module__)) else held.__code__
     if isinstance(held, type):
         return _values_of(held, seen) if _editable(held.__module__) else _Same(held)
-    if isinstance(held, (tuple, list)):
-        return type(held), *(_value(part, seen) for part in held)
-    if isinstance(held, dict):
-        return tuple((repr(key), _value(part, seen)) for key, part in held.items())
+    if isinstance(held, (tuple, list, dict)):
+        if id(held) in seen:  # it may hold itself
+            return "again"
+        seen.add(id(held))
+        parts = held.items() if isinstance(held, dict) else enumerate(held)
+        return type(held), *((repr(key), _value(part, seen)) for key, part in parts)
     if isinstance(held, np.ndarray) and held.dtype != object:
         return held.shape, held.dtype.str, held.tobytes()
     if isinstance(held, _PLAIN) or type(held) is float:
