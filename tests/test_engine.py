@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from tailgate.engine import objects
+from tailgate.engine.agreement import ROWS, apart
 from tailgate.engine.evaluation import evaluate
 from tailgate.engine.graph import Graph, Node
 from tailgate.engine.operations import BOOL, COMPARISONS, DTYPES, FLOAT
 from tailgate.engine.program import Program, _pool
-from tailgate.engine.tracing import Trace
+from tailgate.engine.tracing import Trace, traced
 
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, 1e-310, -5e-324, 1e308, -1e308, np.inf, -np.inf, np.nan, 2.0**63, -(2.0**63), 3.7, 255.5])
 
@@ -180,3 +181,22 @@ def test_a_user_without_a_home_keeps_no_objects(monkeypatch: pytest.MonkeyPatch)
     for name in ("TAILGATE_CACHE", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     assert objects.folder() is None
+
+
+def test_the_comparison_with_the_plain_loop_reaches_late_steps():
+    """Code that is wrong from step 90 on is found, although the comparison plays 24 steps."""
+
+    def played(late):
+        def step(held, _=None):
+            loop = held["loop"]
+            x = loop["x"] + np.where(loop["k"] >= 90, late, 1.0)
+            return {"loop": {"k": loop["k"] + 1, "x": x}}, {"x": x}
+
+        return step
+
+    def begun(rows):
+        return {"loop": {"k": np.zeros(rows, np.int64), "x": np.arange(rows) * 1.0}}
+
+    program = Program(traced(played(2.0), begun(1), {}))
+    assert apart(program, begun(ROWS), played(2.0), 120) == ""
+    assert apart(program, begun(ROWS), played(3.0), 120) == "loop.x, step 13"

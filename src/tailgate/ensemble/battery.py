@@ -16,7 +16,7 @@ from tailgate.core.draws import Draws, Keys
 from tailgate.core.kinds import EFFECTS, Kind
 from tailgate.core.loop import Loop
 from tailgate.core.threat import Brief
-from tailgate.engine.agreement import ROWS, TRIED, Untraced, apart, check_open
+from tailgate.engine.agreement import ROWS, Untraced, apart, check_open
 from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, Program, State
 from tailgate.engine.remembered import Remembered
@@ -217,5 +217,5 @@ def _keys(batch: int) -> Keys:
 
 
 def _difference(made: Battery, few: object) -> str:
-    first, steps = begun(made.loop, _keys(ROWS), few), min(TRIED, made.loop.horizon)
-    return apart(made.program, first, lambda held: step(made.loop, made.attack, made.plan, held), steps)
+    first = begun(made.loop, _keys(ROWS), few)
+    return apart(made.program, first, lambda held: step(made.loop, made.attack, made.plan, held), made.loop.horizon)

@@ -10,7 +10,7 @@ import numpy as np
 from tailgate.core import Attack
 from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import Loop, LoopState
-from tailgate.engine.agreement import ROWS, TRIED, Untraced, apart, check_open
+from tailgate.engine.agreement import ROWS, Untraced, apart, check_open
 from tailgate.engine.cards import device
 from tailgate.engine.operations import Array
 from tailgate.engine.parameters import lifted
@@ -124,4 +124,4 @@ def _sensed(loop: Loop, begun: Episodes) -> Episodes:
 def _difference(rollout: Rollout) -> str:
     from tailgate.core import draws
 
-    return apart(rollout.program, rollout.begun(draws.keys("tune", range(ROWS))), rollout.plain, min(TRIED, rollout.loop.horizon))
+    return apart(rollout.program, rollout.begun(draws.keys("tune", range(ROWS))), rollout.plain, rollout.loop.horizon)
