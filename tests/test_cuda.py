@@ -73,7 +73,12 @@ def test_make_vec_through_the_bindings(nvidia: Any, tmp_path: Any, monkeypatch: 
         got: list[Any] = []
         if turn == 5:
             driver.current = None  # as in a thread that has no context yet
-            thread = threading.Thread(target=lambda: got.append(one.step(actions)))  # noqa: B023
+
+            def other() -> None:
+                cards.card().stream = 7
+                got.append(one.step(actions))  # noqa: B023
+
+            thread = threading.Thread(target=other)
             thread.start()
             thread.join()
         elif turn == 8:
@@ -84,7 +89,7 @@ def test_make_vec_through_the_bindings(nvidia: Any, tmp_path: Any, monkeypatch: 
             got.append(one.step(actions))
         for first, second in zip(got[0], two.step(actions), strict=True):
             same(*(value if isinstance(value, dict) else np.asarray(value) for value in (first, second)))
-    assert driver.streams == {0}
+    assert driver.streams == {0, 7} and cards.card().stream == 0, "a stream is a thread's own"
 
 
 @needs_compiler

@@ -33,7 +33,7 @@ class Card(Protocol):
     name: str
     kind: str  # what compiled code depends on: the card's capability, the compiler and its options
     tensors: str  # where a library of tensors keeps what is on this card, in its own words
-    stream: int  # the queue of work, of those that the library of tensors has; 0 is the usual one
+    stream: int  # the queue of this thread's work, of those that the library of tensors has; 0 is the usual one
 
     def compiled(self, text: str) -> bytes:
         """Return the machine code of CUDA C."""

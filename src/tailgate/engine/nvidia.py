@@ -6,6 +6,7 @@ Code is compiled for this card's instructions, so that the driver compiles nothi
 from __future__ import annotations
 
 import functools
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -98,9 +99,18 @@ class Nvidia:
         self._processors = read(part.CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT)
         self._options = [f"--gpu-architecture=sm_{architecture}", *OPTIONS]
         self.kind = f"sm_{architecture} nvrtc {compiler[0]}.{compiler[1]} {' '.join(OPTIONS)}"
-        self.stream = 0
+        self._queues = threading.local()
         self._context = _ok(driver.cuDevicePrimaryCtxRetain(device))
         self._here()
+
+    @property
+    def stream(self) -> int:
+        """The stream of this thread's work; 0 unless it was set."""
+        return getattr(self._queues, "stream", 0)
+
+    @stream.setter
+    def stream(self, stream: int) -> None:
+        self._queues.stream = stream
 
     def _here(self) -> None:
         _ok(driver.cuCtxSetCurrent(self._context))
