@@ -64,3 +64,9 @@ def test_issue_forms_are_forms() -> None:
         form = yaml.safe_load(path.read_text())
         assert form["name"] and form["description"] and any(part.get("validations", {}).get("required") for part in form["body"])
         assert all(part["attributes"].get("label") or part["type"] == "markdown" for part in form["body"])
+
+
+def test_the_form_for_a_defence_names_every_board() -> None:
+    text = (ROOT / ".github/ISSUE_TEMPLATE/defence.yml").read_text()
+    boards = {path.parent.name for path in (ROOT / "results").glob("*/board.json*")}
+    assert len(boards) > 9 and {name for name in boards if name not in text} == set()
