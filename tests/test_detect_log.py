@@ -12,7 +12,7 @@ from tailgate.core.threat import ThreatModel
 from tailgate.play.trace import rollout
 from tailgate.roads.detect_log import Settings, at_hours, detect, draw, figures, smoothed, synthetic, threat_of, write_parquet
 from tailgate.roads.readers import mapping_of, read
-from tailgate.roads.recording import Raw, checked
+from tailgate.roads.recording import Raw, Recording, checked
 from tailgate.roads.replayed import Noise, cut, loop_over, rows
 
 from . import logs
@@ -69,6 +69,14 @@ def test_the_smoother_is_nearer_to_the_truth_than_the_filter():
 
 
 @pytest.mark.long
+def test_a_piece_is_smoothed_alone_as_next_to_a_longer_one():
+    long, short = (_recording(seconds=seconds)[0] for seconds in (60.0, 30.0))
+    both = Recording("two", 0.1, (short.segments[0], long.segments[0]))
+    smooth, n = smoothed(cut(both, Noise(), None)), len(short.segments[0].gap)
+    assert np.array_equal(smooth[0, :n], smoothed(cut(short, Noise(), None))[0]) and np.isnan(smooth[0, n:]).all()
+    assert np.array_equal(smooth[1], smoothed(cut(long, Noise(), None))[0])
+
+
 def test_false_alarms_are_counted():
     """Of a chi-square test at the level that one in 50 readings exceeds, on noise as it is told."""
     recording, _ = _recording(seconds=1200.0)

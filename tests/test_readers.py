@@ -90,6 +90,23 @@ def test_repairs_are_counted():
     assert (~found.segments[0].seen).sum() == 11 and found.segments[0].gap[55] == found.segments[0].gap[49]
 
 
+def test_lost_samples_are_readings_that_did_not_arrive():
+    """One sample in 40, as a radar loses cycles: a single segment, on the grid, with the samples that are there as they are."""
+    lost = np.arange(30, len(logs.T) - 5, 40)
+    lost = np.sort(np.concatenate([lost, [200 + 1, 200 + 2, 200 + 3]]))
+    there = np.setdiff1d(np.arange(len(logs.T)), lost)
+    columns = logs.GAP, logs.LEAD - logs.OWN, logs.OWN
+    whole, found = checked(Raw("", logs.T, *columns), "file"), checked(Raw("", logs.T[there], *(x[there] for x in columns)), "file")
+    ((one,), (two,)) = whole.segments, found.segments
+    assert found.repairs == {"lost samples": len(lost)} and (np.flatnonzero(~two.seen) == lost).all()
+    for a, b in zip(one[1:4], two[1:4], strict=True):
+        assert np.abs(a - b)[there].max() < 1e-9
+    assert np.abs(one.speed - two.speed).max() < 0.05
+    few = np.flatnonzero(np.arange(len(logs.T)) % 7 < 3)
+    with pytest.raises(InputError, match="missing or lost'; expected at most 50%"):
+        checked(Raw("", logs.T[few], *(x[few] for x in columns)), "file")
+
+
 def test_jitter_is_interpolated_and_short_segments_are_dropped():
     t = logs.T + 0.012 * np.sin(7.0 * np.arange(len(logs.T)))
     t[300:330] += 10.0
@@ -103,6 +120,23 @@ def test_a_unit_of_another_kind_is_refused():
     for text, wanted in (("gap=d:km/h", "ft, km, m"), ("gap=d:s", "ft, km, m"), ("t=time:m", "ms, ns, s, us"), ("speed=v:ft", "ft/s, km/h, m/s, mph")):
         with pytest.raises(InputError, match=rf"--map: unit of {text.partition('=')[0]}: got '{text.rpartition(':')[2]}'.*{wanted}"):
             mapping_of([text])
+
+
+@pytest.mark.parametrize(
+    ("choice", "words"),
+    [
+        (Choice(lead="nobody"), "--lead: got 'nobody'; expected none: of these options the format trace takes --vehicle"),
+        (Choice(length=4.0), "--length: got 4.0"), (Choice(mapping=(("t", "a", ""),)), "--map: got 't=a'"),
+    ],
+)  # fmt: skip
+def test_an_option_that_the_format_does_not_have_is_refused(choice, words):
+    with pytest.raises(InputError, match=re.escape(words)):
+        read("asta-string", choice=choice)
+
+
+def test_a_track_of_one_car_has_no_other():
+    with pytest.raises(InputError, match="--vehicle: got '2'; expected none: comma2k19-radar has one car"):
+        read("comma2k19-radar", choice=Choice(vehicle="2"))
 
 
 def test_a_mapping_is_checked():

@@ -57,33 +57,31 @@ class Played(NamedTuple):
     attack: str
     pieces: Cut
     trace: Trace
-    smooth: Array  # (R, K, 2) gap [m] and relative speed [m/s] of the smoother
+    smooth: Array  # (R, K, 2) gap [m] and relative speed [m/s] of the smoother; NaN behind the end of a piece
 
 
 def smoothed(held: Cut) -> Array:
-    """Return gap and relative speed (R, K, 2) by the smoother of Rauch, Tung and Striebel (filterpy).
+    """Return gap and relative speed (R, K, 2) by the smoother of Rauch, Tung and Striebel (filterpy); NaN behind the end of a piece.
 
     Its state is place, speed and acceleration of the car ahead; the own place is the recorded speed, summed. No input is needed then.
     """
     from filterpy.kalman import KalmanFilter
 
     plant, dt = held.plant, held.plant.dt
-    out = np.empty((*plant.gap.shape, 2))
-    for i in range(len(plant.gap)):
-        own = np.concatenate([[0.0], np.cumsum(0.5 * dt * (plant.speed[i, 1:] + plant.speed[i, :-1]))])
+    out = np.full((*plant.gap.shape, 2), np.nan)
+    for i, length in enumerate(held.length.tolist()):
+        gap, relative, speed, seen = (x[i, :length] for x in (plant.gap, plant.relative, plant.speed, plant.seen))
+        own = np.concatenate([[0.0], np.cumsum(0.5 * dt * (speed[1:] + speed[:-1]))])
         filter_ = KalmanFilter(dim_x=3, dim_z=2)
         filter_.F = np.array([[1.0, dt, dt * dt / 2.0], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
         filter_.H, filter_.Q = np.eye(2, 3), np.diag([1e-8, 1e-8, JERK_VAR * dt])
         filter_.R = np.diag([plant.noise.range_sd**2, plant.noise.speed_sd**2])
-        filter_.x = np.array([plant.gap[i, 0], plant.relative[i, 0] + plant.speed[i, 0], 0.0])
+        filter_.x = np.array([gap[0], relative[0] + speed[0], 0.0])
         filter_.P = np.diag([1.0, 1.0, 1.0])
-        z = [
-            np.array([plant.gap[i, k] + own[k], plant.relative[i, k] + plant.speed[i, k]]) if plant.seen[i, k] else None
-            for k in range(len(own))
-        ]
+        z = [np.array([gap[k] + own[k], relative[k] + speed[k]]) if seen[k] else None for k in range(length)]
         means, covariances, _, _ = filter_.batch_filter(z)
         x = filter_.rts_smoother(means, covariances)[0]
-        out[i] = np.stack([x[:, 0] - own, x[:, 1] - plant.speed[i]], axis=1)
+        out[i, :length] = np.stack([x[:, 0] - own, x[:, 1] - speed], axis=1)
     return out
 
 

@@ -32,6 +32,10 @@ TIMES, LENGTHS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}, {"m": 1.0, "km"
 SPEEDS = {"m/s": 1.0, "km/h": 1.0 / 3.6, "mph": 0.44704, "ft/s": 0.3048}
 UNITS = TIMES | LENGTHS | SPEEDS
 WANTED = {"t": TIMES, "gap": LENGTHS, "speed": SPEEDS, "relative_speed": SPEEDS, "lead_speed": SPEEDS}  # and their units
+TAKES = {
+    "openacc": ("vehicle",), "ultra-av": ("vehicle",), "comma2k19": ("vehicle",), "sumo-fcd": ("vehicle", "lead", "length"),
+    "veremi": ("lead", "length"), "csv": ("map",), "trace": ("vehicle",),
+}  # fmt: skip
 HEADER = 20  # lines before the header of an OpenACC file, at most
 LENGTH = 5.0  # of a vehicle whose length nobody tells [m]
 SILENCE = 2.5  # times the usual time between two messages: nothing is interpolated across a longer one
@@ -72,6 +76,7 @@ def read(source: str, format: str | None = None, choice: Choice = Choice()) -> l
     if format is not None and format not in FORMATS:
         raise unknown("--format", format, FORMATS)
     kind = format or _kind(source, path, choice)
+    _check_choice(kind, choice)
     readers: dict[str, Callable[[], list[Raw]]] = {
         "openacc": lambda: _openacc(_table(path, _is_openacc), choice), "ultra-av": lambda: _ultra_av(_table(path), choice),
         "comma2k19": lambda: _comma(path, choice), "veremi": lambda: _veremi(path, choice), "csv": lambda: _mapped(_table(path), choice),
@@ -88,6 +93,15 @@ def read(source: str, format: str | None = None, choice: Choice = Choice()) -> l
     if dropped := len(raws) - len(long):
         found[0].repairs[f"recordings below {LEAST:g} s or {FEWEST} samples dropped"] = dropped
     return [dataclasses.replace(one, name=one.name or path.name) for one in found]
+
+
+def _check_choice(kind: str, choice: Choice) -> None:
+    """Raise InputError for an option that a format does not have."""
+    given = {"vehicle": choice.vehicle, "lead": choice.lead, "length": choice.length if choice.length != LENGTH else None}
+    for name, value in (given | {"map": choice.mapping or None}).items():
+        if value is not None and name not in TAKES[kind]:
+            wanted = f"none: of these options the format {kind} takes {' and '.join(f'--{other}' for other in TAKES[kind])}"
+            raise InputError(f"--{name}", " ".join(map("=".join, (part[:2] for part in value))) if name == "map" else value, wanted)
 
 
 def _kind(source: str, path: Path, choice: Choice) -> str:
@@ -216,6 +230,8 @@ def _mapped(table: Table, choice: Choice) -> list[Raw]:
 def _trace(source: str, choice: Choice) -> list[Raw]:
     held = trace(source, "file")
     if "relative_speed1" in held:
+        if choice.vehicle is not None:
+            raise InputError("--vehicle", choice.vehicle, f"none: {source} has one car")
         return [Raw("", held["t"], held["gap1"], held["relative_speed1"], held["speed2"])]
     named = {key.replace("speed", "Speed").replace("gap", "IVS"): value for key, value in held.items()}
     return _followers(lambda name: named[name], list(named), held["t"], choice, source)

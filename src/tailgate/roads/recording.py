@@ -17,7 +17,8 @@ HURRIED = 60.0  # typical speed that is more likely in another unit [m/s]
 FARTHEST = 1000.0  # admitted gap [m]
 MISSING = 0.5  # largest share of missing readings
 REPEATED = 0.01  # largest share of repeated times
-BREAK = 1.5  # times the distance of samples: a longer one ends a segment
+BREAK = 1.5  # times the distance of samples: in a longer one samples are lost
+SILENCE = 0.5  # lost samples in a longer time end a segment; in a shorter one they are readings that did not arrive [s]
 MOST = 5_000_000  # samples
 OFF = 5.0  # median difference of relative speed and the gap's rate that no sensor has [m/s]
 
@@ -68,8 +69,8 @@ class Recording:
 def checked(raw: Raw, where: str) -> Recording:
     """Return the recording on a uniform grid. Repairs are counted; what is not one of them is refused.
 
-    Repeated times are dropped (up to 1 %), missing or impossible readings are marked, and samples that jitter are interpolated. A hole
-    in time ends a segment; segments below 5 s are dropped.
+    Repeated times are dropped (up to 1 %), missing or impossible readings are marked, and samples that jitter are interpolated. Lost samples
+    count as readings that did not arrive; a hole of more than 0.5 s ends a segment. Segments below 5 s are dropped.
 
     Raises
     ------
@@ -101,7 +102,8 @@ def checked(raw: Raw, where: str) -> Recording:
     if not RATE[0] <= dt <= RATE[1]:
         raise InputError(f"{name}: time between samples", dt, f"{RATE[0]:g} to {RATE[1]:g} s; is the unit a second?")
     raw = _possible(raw, name, repairs)
-    holes = np.flatnonzero(step > BREAK * dt) + 1
+    longest = max(BREAK * dt, SILENCE + 1e-6)
+    holes = np.flatnonzero(step > longest) + 1
     if len(holes):
         repairs["holes in time"] = len(holes)
     segments = []
@@ -111,8 +113,10 @@ def checked(raw: Raw, where: str) -> Recording:
             continue
         segments.append(_uniform(raw, part, dt, repairs))
     if not segments:
-        raise InputError(f"{name}: time", f"{len(holes)} holes", f"a segment of {LEAST:g} s without a hole above {BREAK:g} times {dt:g} s")
+        raise InputError(f"{name}: time", f"{len(holes)} holes", f"a segment of {LEAST:g} s without a hole above {longest:g} s")
     out = Recording(raw.name, dt, tuple(segments), repairs)
+    if (absent := out.samples - sum(int(part.seen.sum()) for part in segments)) > MISSING * out.samples:
+        raise InputError(f"{name}: gap", f"{absent} of {out.samples} missing or lost", f"at most {MISSING:.0%}")
     _meant(out, name)
     return out
 
@@ -145,15 +149,21 @@ def _possible(raw: Raw, name: str, repairs: dict[str, int]) -> Raw:
 
 
 def _uniform(raw: Raw, part: Array, dt: float, repairs: dict[str, int]) -> Segment:
-    """Return the samples of a segment on a grid of dt [s]."""
+    """Return the samples of a segment on a grid of dt [s]; where samples are lost, the own speed is interpolated."""
     t = raw.t[part]
     count = round(float((t[-1] - t[0]) / dt)) + 1
     grid = t[0] + dt * np.arange(count)
-    even = count == len(t) and bool(np.abs(t - grid).max() <= 1e-6 + 0.02 * dt)
     columns = [raw.gap[part], raw.relative_speed[part], raw.speed[part]]
-    if not even:
+    places = np.rint((t - t[0]) / dt).astype(np.int64)
+    if np.abs(t - t[0] - dt * places).max() > 1e-6 + 0.02 * dt:
         repairs["samples interpolated to even times"] = repairs.get("samples interpolated to even times", 0) + count
+    if count > len(t) or np.abs(t - grid[: len(t)]).max() > 1e-6 + 0.02 * dt:
         columns = [np.interp(grid, t, column) for column in columns]  # a missing neighbour leaves NaN
+    before = np.clip(np.searchsorted(t, grid, "right") - 1, 0, len(t) - 2)
+    lost = (t[before + 1] - t[before] > BREAK * dt) & (np.minimum(grid - t[before], t[before + 1] - grid) > 0.5 * dt)
+    if lost.any():
+        repairs["lost samples"] = repairs.get("lost samples", 0) + int(lost.sum())
+        columns[:2] = (np.where(lost, np.nan, column) for column in columns[:2])
     gap, relative, speed = columns
     seen = np.isfinite(gap) & np.isfinite(relative)
     return Segment(float(t[0]), _kept(gap, seen), _kept(relative, seen), speed, seen)
