@@ -19,7 +19,7 @@ from fuzz_roads import ROADS, beside_recorded, read_recorded, recorded
 from fuzz_texts import TEXTS
 
 ROOT = Path(__file__).parents[1]
-CONFIGS, RESULTS = ROOT / "configs", ROOT / "results"
+RESULTS = ROOT / "results"
 BOARD = RESULTS / "quick-v0"
 POLICY = ROOT / "agents" / "policies" / "car-following-chi2_kf-0.json"
 _held: dict[str, Any] = {}  # what is made once in a process

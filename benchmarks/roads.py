@@ -40,6 +40,7 @@ DEFENCES = ("none", "kf", "rkf", "imm", "chi2_kf", "chi2_kf_sparse", "windowed_c
 DETECTORS = ("chi2_kf", "chi2_kf_sparse", "windowed_chi2_kf", "cusum_kf", "mewma_kf", "rkf", "imm")
 RECORDINGS = (("asta-string", "asta-braking"), ("comma2k19-radar",))  # of one rate each
 RESAMPLES, GAPS = 2000, (1.2, 3.0)  # time gaps [s] of the comparison with all else equal
+ONE_EVENT = 5.0  # alarms of all cars of a drive within this time are one event [s]
 
 
 def crashed(scenario: Scenario, defence: str, attack: str, dose: int, episodes: int) -> np.ndarray | None:
@@ -83,20 +84,22 @@ def part_alarms(options: argparse.Namespace) -> dict[str, Any]:
             except (NotApplicable, ValueError) as error:
                 out["defences"].setdefault(defence, {})[f"{dt:g}"] = {"left out": str(error)}
                 continue
-            alarms, hours, each = 0, 0.0, {}
+            alarms, hours, each, when = 0, 0.0, {}, {}
             for name, recording in recordings:
                 held = cut(recording, Noise(), None)
                 threat = detect_log.threat_of(detect_log.Settings(), dt, held.plant.gap.shape[1] - 1)
                 trace = rollout(loop_over(held, guard, bench.uses, threat), Spec("attack", "none").make(), rows(held))
                 row = detect_log.figures(detect_log.Played(recording.name, defence, "none", held, trace, detect_log.smoothed(held)), dt)
                 alarms, hours = alarms + row["alarms"], hours + row["hours"]
-                each[f"{name} {recording.name}".strip()] = {"alarms": row["alarms"], "hours": row["hours"], "alarm_share": row["alarm_share"]}
-            low, high = mean_time(alarms, hours)
+                when.setdefault(name, []).extend(row["alarm_times"])
+                each[f"{name} {recording.name}".strip()] = {key: row[key] for key in ("alarms", "alarm_times", "hours", "alarm_share")}
+            events = sum(1 + int((np.diff(np.sort(times)) > ONE_EVENT).sum()) for times in when.values() if times)
+            low, high = mean_time(events, hours)
             out["defences"].setdefault(defence, {})[f"{dt:g}"] = {
-                "threshold": found["threshold"], "synthetic": found["measured"], "synthetic_fresh": found["fresh"], "alarms": alarms, "hours": hours,
-                "per_hour": alarms / hours, "low": 0.0 if high is None else 1.0 / high, "high": 1.0 / low, "recordings": each,
+                "threshold": found["threshold"], "synthetic": found["measured"], "synthetic_fresh": found["fresh"], "alarms": alarms, "events": events, "hours": hours,
+                "per_hour": events / hours, "low": 0.0 if high is None else 1.0 / high, "high": 1.0 / low, "recordings": each,
             }  # fmt: skip
-            print(f"  {defence} at {dt:g} s: {alarms} alarms in {hours:.3f} h", file=sys.stderr, flush=True)
+            print(f"  {defence} at {dt:g} s: {alarms} alarms, {events} events in {hours:.3f} h", file=sys.stderr, flush=True)
     return out
 
 
@@ -112,82 +115,99 @@ def part_order(options: argparse.Namespace) -> dict[str, Any]:
     }  # fmt: skip
     out: dict[str, Any] = {"seconds": {"synthetic": [0.1 * d for d in old.doses], "road": [0.05 * d for d in new.doses]}, "attacks": {"synthetic": black, "road": mine}}
     out["harm"] = {name: {str(dose): harms(place, attacks, dose, n) for dose in doses} for name, (place, attacks, doses, n) in places.items()}
-    out["summary"] = summary(out["harm"])
+    out["summary"] = summary(out["harm"], options.episodes)
     return out
 
 
-def undamaged(held: dict[str, dict[str, str]], rng: np.random.Generator | None = None) -> dict[str, float]:
-    """The share of undamaged episodes under the worst attack, of each defence; with `rng` on resampled episodes."""
-    out = {}
-    for defence, attacks in held.items():
-        table = np.array([list(map(int, hits)) for hits in attacks.values()])
-        pick = slice(None) if rng is None else rng.integers(0, table.shape[1], table.shape[1])
-        out[defence] = 1.0 - float(table[:, pick].mean(axis=1).max())
-    return out
+Harm = dict[str, dict[str, dict[str, str]]]  # dose, defence, attack -> the episodes with a collision, a 0 or 1 each
 
 
-def scores(doses: dict[str, Any], rng: np.random.Generator | None = None) -> dict[str, float]:
-    """The mean over doses of what is undamaged."""
-    each = [undamaged(held, rng) for held in doses.values()]
+def scores(doses: Harm, pick: Any = slice(None)) -> dict[str, float]:
+    """The mean over doses of the share of undamaged episodes under the worst attack, of each defence; `pick`: of these episodes."""
+    each = [{
+        defence: 1.0 - float(np.array([np.frombuffer(hits.encode(), np.uint8) - 48 for hits in attacks.values()])[:, pick].mean(axis=1).max())
+        for defence, attacks in held.items()
+    } for held in doses.values()]  # fmt: skip
     return {defence: float(np.mean([part[defence] for part in each])) for defence in each[0]}
 
 
-def summary(harm: dict[str, Any]) -> dict[str, Any]:
-    """Scores, and rank correlations with intervals: over defences and episodes, both resampled."""
-    base = {name: scores(doses) for name, doses in harm.items()}
-    out: dict[str, Any] = {"scores": base, "correlation": {}}
-    for one, two in (("synthetic", "road"), ("synthetic", "string"), ("road", "string")):
-        out["correlation"][f"{one}, {two}"] = correlation(harm[one], harm[two])
+def resampled(held: Harm, rng: np.random.Generator, blocks: list[np.ndarray] | None) -> dict[str, float]:
+    """Scores on resampled episodes, the same for all defences, attacks and doses: whole blocks of a recording, or single episodes."""
+    count = len(next(iter(next(iter(next(iter(held.values())).values())).values())))
+    if blocks is None:
+        return scores(held, rng.integers(0, count, count))
+    some = [block[block < count] for block in blocks]
+    some = [block for block in some if len(block)]
+    return scores(held, np.concatenate([some[i] for i in rng.integers(0, len(some), len(some))]))
+
+
+def report_blocks(episodes: int) -> list[np.ndarray]:
+    """Report episodes by the block of the recording in which they begin."""
+    place = load_scenario("road-following-v0")
+    begun = place.loop(Spec("defence", "kf").make(), ()).start(draws.keys("report", range(episodes))).manoeuvre.at
+    joined = [block for block in place.manoeuvre.blocks(place.plant.dt)[1] if block.purpose == "report"]
+    return [np.flatnonzero((begun >= block.first) & (begun < block.last)) for block in joined]
+
+
+def correlations(harm: dict[str, Harm], pairs: Sequence[tuple[str, str]], episodes: int) -> dict[str, Any]:
+    """Rank correlations of the scores in pairs of places, and the last less the first, with intervals.
+
+    Defences are resampled, and episodes: by blocks on the recorded road, one by one on the synthetic one. All pairs share what is drawn.
+    """
+    base, blocks = {name: scores(held) for name, held in harm.items()}, report_blocks(episodes)
+    names = list(next(iter(base.values())))
+    rng, drawn = np.random.default_rng(0), []
+    for _ in range(RESAMPLES):
+        some = [names[i] for i in rng.integers(0, len(names), len(names))]
+        own = {name: resampled(held, rng, None if name == "synthetic" else blocks) for name, held in harm.items()}
+        columns = {name: [part[defence] for defence in some] for name, part in own.items()}
+        if all(len(set(column)) > 1 for column in columns.values()):
+            drawn.append([spearmanr(columns[one], columns[two]).statistic for one, two in pairs])
+    table = np.array(drawn)
+    low, high = np.quantile(table, [0.025, 0.975], axis=0)
+    out: dict[str, Any] = {}
+    for i, (one, two) in enumerate(pairs):
+        x, y = ([base[place][name] for name in names] for place in (one, two))
+        out[f"{one}, {two}"] = {"spearman": float(spearmanr(x, y).statistic), "spearman_interval": [float(low[i]), float(high[i])],
+                                "kendall": float(kendalltau(x, y).statistic)}  # fmt: skip
+    if len(pairs) > 1:
+        first, last = (out[f"{one}, {two}"]["spearman"] for one, two in (pairs[0], pairs[-1]))
+        out["last less first"] = {"spearman": last - first, "spearman_interval": [float(x) for x in np.quantile(table[:, -1] - table[:, 0], [0.025, 0.975])]}
     return out
 
 
-def correlation(one: dict[str, Any], two: dict[str, Any]) -> dict[str, Any]:
-    """Rank correlations of the scores in two places, with intervals: over defences and episodes, both resampled."""
-    base = scores(one), scores(two)
-    names = list(base[0])
-    rng, drawn = np.random.default_rng(0), []
-    for _ in range(RESAMPLES):
-        a, b = scores(one, rng), scores(two, rng)
-        some = [names[i] for i in rng.integers(0, len(names), len(names))]
-        x, y = ([part[name] for name in some] for part in (a, b))
-        if len(set(x)) > 1 and len(set(y)) > 1:
-            drawn.append((spearmanr(x, y).statistic, kendalltau(x, y).statistic))
-    x, y = ([part[name] for name in names] for part in base)
-    low, high = np.quantile(np.array(drawn), [0.025, 0.975], axis=0)
-    return {
-        "defences": len(names), "spearman": float(spearmanr(x, y).statistic), "spearman_interval": [float(low[0]), float(high[0])],
-        "kendall": float(kendalltau(x, y).statistic), "kendall_interval": [float(low[1]), float(high[1])],
-    }  # fmt: skip
+def summary(harm: dict[str, Harm], episodes: int) -> dict[str, Any]:
+    """Scores of each place, and rank correlations with intervals."""
+    pairs = (("synthetic", "road"), ("synthetic", "string"), ("road", "string"))
+    return {"scores": {name: scores(doses) for name, doses in harm.items()}, "defences": len(DEFENCES), "correlation": correlations(harm, pairs, episodes)}
 
 
 def at_gap(gap: float) -> tuple[Scenario, list[str]]:
     """The car of road-v0 at another time gap [s], and the black-box scripts of the suite; a trigger at a gap moves with it."""
-    base, threshold = load_scenario("road-following-v0"), f"threshold={round(3.5 + 19.0 * gap)}"  # the median gap, as 25 m is at 1.2 s
+    base, threshold = load_scenario("road-following-v0"), f"threshold={round(3.5 + 21.5 * gap / 1.2, 1):g}"  # met at the speed at which 25 m are at 1.2 s
     scripts = [text for text in load_suite("road-v0").attacks if Spec("attack", text).entry.knowledge == "black"]
     place = dataclasses.replace(base, controller=dataclasses.replace(base.controller, headway=gap), plant=dataclasses.replace(base.plant, time_gap=gap))
     return place, [text.replace("threshold=25", threshold) for text in scripts]
 
 
 def part_headway(options: argparse.Namespace) -> dict[str, Any]:
-    """The order of the defences at 1.2 and at 3 s: same car, sensor, leaders, and kinds and sizes of attacks. By blocks of the recording too."""
-    harm = {}
-    for gap in GAPS:
-        place, attacks = at_gap(gap)
-        harm[gap] = {str(dose): harms(place, attacks, dose, options.episodes) for dose in load_suite("road-v0").doses}
-    out: dict[str, Any] = {"scores": {f"{gap:g}": scores(held) for gap, held in harm.items()}, "correlation": correlation(*harm.values())}
-    loop = place.loop(Spec("defence", "kf").make(), ())
-    begun = loop.start(draws.keys("report", range(options.episodes))).manoeuvre.at
-    joined = [block for block in place.manoeuvre.blocks(place.plant.dt)[1] if block.purpose == "report"]
+    """The order of the defences at 1.2 and at 3 s: same car, sensor, leaders, and kinds and sizes of attacks. By blocks of the recording too.
+
+    What was played at 1.2 s is that of the part `order`: the same scenario, scripts and episodes.
+    """
+    order = json.loads((options.out / "order.json").read_text(encoding="utf-8"))
+    near, far = GAPS
+    assert at_gap(near) == (load_scenario("road-following-v0"), order["attacks"]["road"])
+    place, attacks = at_gap(far)
+    held = {"synthetic": order["harm"]["synthetic"], f"{near:g}": order["harm"]["road"],
+            f"{far:g}": {str(dose): harms(place, attacks, dose, options.episodes) for dose in load_suite("road-v0").doses}}  # fmt: skip
+    pairs = ("synthetic", f"{near:g}"), (f"{near:g}", f"{far:g}")
+    out: dict[str, Any] = {"scores": {name: scores(part) for name, part in held.items()}, "correlation": correlations(held, pairs, options.episodes)}
     out["blocks"] = []
-    for block in joined:
-        mine = np.flatnonzero((begun >= block.first) & (begun < block.last))
-        parts = [
-            {dose: {defence: {attack: "".join(hits[i] for i in mine) for attack, hits in attacks.items()} for defence, attacks in held.items()} for dose, held in doses.items()}
-            for doses in harm.values()
-        ]  # fmt: skip
-        found = correlation(*parts)
-        out["blocks"].append({"episodes": len(mine), "spearman": found["spearman"], "scores": {f"{gap:g}": scores(part) for gap, part in zip(GAPS, parts, strict=True)}})
-    return out
+    for mine in report_blocks(options.episodes):
+        found = [scores(held[f"{gap:g}"], mine) for gap in GAPS]
+        out["blocks"].append({"episodes": len(mine), "spearman": float(spearmanr(*([part[name] for name in DEFENCES] for part in found)).statistic)})
+    return out | {"harm": held[f"{far:g}"]}
 
 
 def part_boards(options: argparse.Namespace) -> dict[str, Any]:
@@ -217,7 +237,8 @@ def part_gaps(options: argparse.Namespace) -> dict[str, Any]:
     for gap in (0.8, 1.2, 2.0, 3.0):
         place, attacks = at_gap(gap)
         out[f"{gap:g}"] = {str(dose): {
-            defence: 1.0 - share for defence, share in undamaged(harms(place, attacks, dose, options.episodes, ("kf", "chi2_kf", "cusum_kf", "rkf"))).items()
+            defence: 1.0 - share
+            for defence, share in scores({"": harms(place, attacks, dose, options.episodes, ("kf", "chi2_kf", "cusum_kf", "rkf"))}).items()
         } for dose in suite.doses}  # fmt: skip
     return out
 

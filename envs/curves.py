@@ -17,7 +17,7 @@ from tailgate.envs.manoeuvres import between
 Curvature = Annotated[float, Field(ge=-0.1, le=0.1, allow_inf_nan=False)]  # [1/m]: no road bends tighter than 10 m
 Radius = Annotated[float, Field(ge=10.0, le=1e6, allow_inf_nan=False)]  # [m]
 Radii = Annotated[tuple[Radius, Radius], Field(min_length=2, max_length=2)]
-STRAIGHT, BEND = 0, 1
+BEND = 1  # the phase of a bend; 0 is that of a straight
 
 
 def eased(curvature: Array, wanted: Array, most: float) -> Array:

@@ -1,6 +1,6 @@
 """Recorded leaders: each episode drives another window of a recording, and no second serves two purposes of seeds.
 
-A recording is cut into blocks. The purposes of seeds own them in turn: train, report, select, tune, calibrate, train, ... An episode's
+That holds for one step and one length of block: blocks are counted in steps. A recording is cut into blocks. The purposes of seeds own them in turn: train, report, select, tune, calibrate, train, ... An episode's
 window begins at a random step of a block of its purpose and ends in the same block.
 """
 

@@ -22,7 +22,7 @@ class EpisodeFilter(Protocol):
         """Begin an episode of one agent: model.C (1, q, n), prior.mean (n,), prior.cov (n, n)."""
 
     def step(self, y: Array, valid: Array, u: Array) -> tuple[Array, float]:
-        """Return the estimate x (n,) and the score after y (q,), valid (q,) bool and the known input u (m,) since the last step."""
+        """Return the estimate x (n,) and the score after y (q,), valid (q,) bool and the known input u (inputs,) since the last step."""
 
 
 @runtime_checkable

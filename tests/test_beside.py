@@ -3,7 +3,6 @@
 import argparse
 import copy
 import dataclasses
-import importlib.util
 import json
 from pathlib import Path
 from typing import Any
@@ -23,11 +22,8 @@ from tailgate.evaluation.cells import cells_of, run
 from tailgate.evaluation.paired import settled
 from tailgate.evaluation.rows import encode
 
-spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
-assert spec is not None and spec.loader is not None
-scored = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(scored)
-BEACON, ROAD, board, cell, entry, suite = scored.BEACON, scored.ROAD, scored.board, scored.cell, scored.entry, scored.suite
+from .scored import BEACON, ROAD, board, cell, entry, suite
+
 Data = dict[str, Any]
 GUARDS = ("none", "kf", "rkf", "imm", "safe_state")
 POLICY = "runs/a/policy-0.json"

@@ -3,9 +3,7 @@
 import copy
 import dataclasses
 import functools
-import importlib.util
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,11 +14,9 @@ from tailgate.board.consistency import strays
 from tailgate.board.files import read_board
 from tailgate.evaluation.attack_list import Admitted
 
-spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
-assert spec is not None and spec.loader is not None
-scored = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(scored)
-OTHER, ROAD, board, cell, entry = scored.OTHER, scored.ROAD, scored.board, scored.cell, scored.entry
+from . import scored
+from .scored import OTHER, ROAD, board, cell, entry
+
 Data = dict[str, Any]
 GUARDS = ("none", "kf", "rkf", "imm", "chi2_kf", "safe_state", "brake_kf")
 USES = {"safe_state": ["measurements", "v2v"], "brake_kf": ["measurements", "v2v"]}

@@ -1,7 +1,6 @@
 """What the timing of a board's trained attackers is worth: played on the board's own episodes, and said on its pages."""
 
 import copy
-import importlib.util
 import json
 import shutil
 from pathlib import Path
@@ -22,6 +21,8 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario, load_suite
 from tailgate.play.trace import Trace, rollout
 from tailgate.site.build import build_site
+
+from .boards import make_board
 
 Data = dict[str, Any]
 ROOT = Path(__file__).parents[1]
@@ -179,12 +180,8 @@ def test_the_command_writes_the_file_and_the_pages_show_it(board: Data, tmp_path
 
 
 def test_what_is_no_timing_of_the_board_is_refused(board: Data, tmp_path: Path) -> None:
-    spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
-    assert spec is not None and spec.loader is not None
-    boards = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(boards)
     with pytest.raises(InputError, match="timing advantages: suite"):
-        build_site([boards.make_board()], tmp_path / "page", measured=[Attachments(timing=Timing.read(ROOT / "results/quick-v0/timing.json"))])
+        build_site([make_board()], tmp_path / "page", measured=[Attachments(timing=Timing.read(ROOT / "results/quick-v0/timing.json"))])
     mine = json.loads(PLACE.read_text())
     for change in ({"hash": "0"}, {"beacon": "0123456789abcdef"}):
         with pytest.raises(InputError, match=f"timing advantages: {next(iter(change))}"):

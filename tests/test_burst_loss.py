@@ -14,8 +14,6 @@ from tailgate.core.scenario import load_scenario
 from tailgate.envs.controllers.cacc import V2V
 from tailgate.play.trace import rollout
 
-SENDERS = ("predecessor", "leader")
-
 
 def place_of(horizon=450, **threat):
     return dataclasses.replace(load_scenario("platoon-v2v-v0").with_threat(**({"onset": 1} | threat)), horizon=horizon)

@@ -84,6 +84,7 @@ def test_false_alarms_are_counted():
     row, alarm = out[0], played[0].trace.alarm[50:, 0, 0]
     assert row["alarm_share"] == pytest.approx(alarm.mean(), rel=0.02) and 0.005 < row["alarm_share"] < 0.06
     rises = int((alarm[1:] & ~alarm[:-1]).sum())
+    assert len(row["alarm_times"]) == row["alarms"] and row["alarm_times"][0] > 5.0 and row["alarm_times"] == sorted(row["alarm_times"])
     assert abs(row["alarms"] - rises) <= 1 and row["alarms_per_hour_low"] < row["alarms_per_hour"] < row["alarms_per_hour_high"]
     assert row["hours"] == pytest.approx((1200.0 - 5.0) / 3600.0, rel=1e-3)
 

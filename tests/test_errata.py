@@ -1,6 +1,5 @@
 """Figures that were superseded, beside a board and on its pages."""
 
-import importlib.util
 import json
 from pathlib import Path
 
@@ -10,10 +9,10 @@ from tailgate.base.errors import InputError
 from tailgate.board.attachments import Attachments, Errata
 from tailgate.site.build import build_site
 
+from . import boards
+
 ROOT = Path(__file__).resolve().parents[1]
-spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
-boards = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(boards)
+
 LINE = {"date": "2026-11-25", "part": "detection", "entries": ["kf"], "what": "Two <b>plants</b> had one threshold.", "moved": "no rank.", "until": "d39bdcd"}
 ALL = LINE | {"date": "2026-11-26", "entries": [], "part": "rows", "what": "A seed was met twice."}
 

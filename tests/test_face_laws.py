@@ -16,7 +16,7 @@ from tailgate.evaluation.cells import Cell, run_cell
 from .engines import short as shortened
 from .tiny import AUTORESETS, CRASHES, SYSTEMS, write
 
-CAR, PLATOON, NETWORK, HIGHWAY = "tailgate/CarFollowing-v0", "tailgate/Platoon-v0", "tailgate/SensorNetwork-v0", "tailgate/Highway-v0"
+CAR, HIGHWAY = "tailgate/CarFollowing-v0", "tailgate/Highway-v0"
 
 
 def spoil(held):

@@ -1,8 +1,6 @@
 """False alarms at the thresholds of a detection board, scenario by scenario."""
 
 import dataclasses
-import importlib.util
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,9 +15,8 @@ from tailgate.evaluation.cells import Cell, run_cell
 from tailgate.site.alarms import drifts_of, table_of, time_text, together_of
 from tailgate.site.suite import Suite
 
-spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
-boards = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(boards)
+from . import boards
+
 ROAD = dataclasses.replace(load_suite("car-following-v0"), scenarios=("gusty-stop-and-go-v0", "car-following-noisy-v0"), robustness=("car-following-noisy-v0",))
 
 

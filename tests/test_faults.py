@@ -1,7 +1,6 @@
 """Killed at every write, fsync, rename and remove: no finished cell is lost, nothing broken is read as good, a rerun gives the same bytes."""
 
 import contextlib
-import importlib.util
 import json
 import os
 import random
@@ -23,10 +22,8 @@ from tailgate.evaluation.attack_list import Admitted, append
 from tailgate.evaluation.cells import Cell, cells_of, run, run_cell
 from tailgate.evaluation.rows import encode, read_rows
 
-spec = importlib.util.spec_from_file_location("dying", Path(__file__).with_name("dying.py"))
-assert spec is not None and spec.loader is not None
-dying = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(dying)
+from . import dying
+
 SUITE = Suite("small", "", ("thesis-ch4-v0",), (5,), ("kf",), ("none", "fdi:value=5", "dos_hold"), 3)
 
 

@@ -1,10 +1,8 @@
 """The leaderboard page: what it says, that nothing in the rows becomes markup, and how it behaves in a browser."""
 
-import importlib.util
 import json
 import re
 from importlib.resources import files
-from pathlib import Path
 
 import pytest
 
@@ -13,10 +11,8 @@ from tailgate.board.words import at_least, breakable, names_of, percent, shade, 
 from tailgate.play.metrics import METRICS
 from tailgate.site.rows_page import build
 
-spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
-boards = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(boards)
-Outline = boards.Outline
+from .boards import Outline
+
 HOSTILE = "evil:<script>document.title='owned'</script>&\"'"
 LONG = "a_very_long_module_name_without_any_space." * 4 + "Defence"
 NONE, JAM, STEALTH, POLICY = "none", "dos_jam:trigger=near,threshold=40", "stealth", "/home/x/runs/sac-a/policy.json"

@@ -1,7 +1,6 @@
 """Boards -v1: lost progress is damage; and pointwise worst, severity, availability and the mean gap next to the worst rate."""
 
 import copy
-import importlib.util
 import json
 import re
 from dataclasses import dataclass, replace
@@ -35,20 +34,9 @@ from tailgate.evaluation.rows import read_rows
 from tailgate.evaluation.stats import limits
 from tailgate.site.build import build_site
 
+from .boards import Outline
+from .scored import OTHER, ROAD, board, cell, clean, entry, rate, suite
 
-def _beside(name: str) -> Any:
-    """Return a module that lies next to this file."""
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-scored, Outline = _beside("scored"), _beside("boards").Outline
-OTHER, ROAD, board, cell, clean, entry, rate, suite = (
-    getattr(scored, name) for name in ("OTHER", "ROAD", "board", "cell", "clean", "entry", "rate", "suite")
-)
 NAMES = ("quick", "car-following", "radar", "platoon", "network")
 MEASURED = suite(progress=0.5, measures=True, attacks=("none", "fdi", "dropout"))
 

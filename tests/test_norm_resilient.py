@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 import tailgate
 from tailgate import num
 from tailgate.core import Innovation, Prior, Received
-from tailgate.core.draws import Role, keys
+from tailgate.core.draws import keys
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
 from tailgate.estimators import DistributedKalmanFilter, NormResilient, NormResilientFilter
@@ -24,7 +24,6 @@ FAMILIES = (
     "ill-conditioned Q", "near-singular Q", "correlated Sv", "nothing new",
 )  # fmt: skip
 LAMS = (0.01, 0.4, 30.0)
-NO_DRAWS = keys("train", [0]).at(Role.DEFENCE, np.zeros(1))
 
 
 def _spd(rng, count, n, low, high):

@@ -1,11 +1,9 @@
 """Scoring: every figure of a board from rows whose answer is known by hand."""
 
 import copy
-import importlib.util
 import json
 import math
 import random
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,10 +18,7 @@ from tailgate.evaluation.paired import mcnemar
 from tailgate.evaluation.stats import limits
 from tailgate.studies.policies import rising
 
-spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
-scored = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(scored)
-CLEAN, NETWORK, OTHER, ROAD, board, cell, clean, entry, rate, suite = scored.CLEAN, scored.NETWORK, scored.OTHER, scored.ROAD, scored.board, scored.cell, scored.clean, scored.entry, scored.rate, scored.suite
+from .scored import NETWORK, OTHER, ROAD, board, cell, clean, entry, rate, suite
 
 
 def test_the_critical_dose_lies_where_the_straight_line_between_two_doses_passes_a_tenth() -> None:

@@ -1,7 +1,6 @@
 """What a board refuses: rows of another threat model, drafts, other policies under an admitted name, and gates that half of the episodes pass."""
 
 import dataclasses
-import importlib.util
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +21,8 @@ from tailgate.evaluation.cells import evaluate
 from tailgate.evaluation.rows import packed, read_rows
 from tailgate.training.adaptive import configs_of, train_against
 
-spec = importlib.util.spec_from_file_location("scored", Path(__file__).with_name("scored.py"))
-scored = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(scored)
-ROAD, board, cell, clean, entry, rate, suite = scored.ROAD, scored.board, scored.cell, scored.clean, scored.entry, scored.rate, scored.suite
+from .scored import ROAD, board, cell, clean, entry, rate, suite
+
 PLAN = {
     "config": "car-following", "dose": 12, "changes": ["environment.interval=20", "environment.frames=1", "teacher=null"], "seeds": 2,
     "learners": {"cem": ["steps=600", "cem={population: 4, episodes: 5, hidden: []}"]}, "knowledge": ["black"],

@@ -2,7 +2,6 @@
 
 import copy
 import hashlib
-import importlib.util
 import json
 import math
 import re
@@ -18,11 +17,10 @@ from tailgate.site.cards import LICENCE
 from tailgate.site.entry import _imported, replay_of
 from tailgate.site.suite import Suite, critical_of
 
+from . import boards
+from .boards import HOSTILE, LONG, Outline, entry, make_board, network
+
 ROOT = Path(__file__).parent.parent
-spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
-boards = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(boards)
-make_board, network, entry, Outline, HOSTILE, LONG = boards.make_board, boards.network, boards.entry, boards.Outline, boards.HOSTILE, boards.LONG
 
 
 @pytest.fixture(scope="module")

@@ -1,18 +1,14 @@
 """The site of boards in a browser: sorting, filters, menus, links, widths, colours, and that it asks for nothing."""
 
-import importlib.util
 import itertools
-from pathlib import Path
 
 import pytest
 
 from tailgate.board.words import percent
 from tailgate.site.build import build_site
 
-spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
-boards = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(boards)
-make_board, entry, HOSTILE, LONG = boards.make_board, boards.entry, boards.HOSTILE, boards.LONG
+from . import boards
+from .boards import HOSTILE, LONG, entry, make_board
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """What the pages of a board say of detection."""
 
-import importlib.util
 import json
 import re
 from pathlib import Path
@@ -13,11 +12,10 @@ from tailgate.board.words import at_least, percent
 from tailgate.site.index import attacks_of, detection_of, ranked_against
 from tailgate.site.suite import Suite
 
+from . import boards
+from .boards import entry, make_board
+
 ROOT = Path(__file__).parents[1]
-spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
-boards = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(boards)
-make_board, entry = boards.make_board, boards.entry
 
 
 @pytest.fixture(scope="module")

@@ -1,10 +1,8 @@
 """What a site refuses, and what its pages are put together of: names of files, axes, numbers in words, the head of a board."""
 
 import copy
-import importlib.util
 import json
 import re
-from pathlib import Path
 
 import pytest
 
@@ -16,10 +14,7 @@ from tailgate.site.build import build_site, slug
 from tailgate.site.charts import Axis, Dot, Line, chart, nice, spread, ticks_at
 from tailgate.site.suite import figure
 
-spec = importlib.util.spec_from_file_location("boards", Path(__file__).with_name("boards.py"))
-boards = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(boards)
-make_board, network, HOSTILE, LONG = boards.make_board, boards.network, boards.HOSTILE, boards.LONG
+from .boards import HOSTILE, LONG, make_board, network
 
 
 @pytest.mark.thin(4)

@@ -1,6 +1,5 @@
 """Measures of strength: twins of a schedule, monotone curves and critical doses; pictures and commands of all."""
 
-import importlib.util
 import json
 import math
 import sys
@@ -25,11 +24,11 @@ from tailgate.studies.policies import label, loop_for, trained
 from tailgate.studies.timing import periodic, play, shuffled, timing, timing_advantage
 from tailgate.studies.transfer import transfer
 
-spec = importlib.util.spec_from_file_location("strong", Path(__file__).with_name("strong.py"))
-assert spec is not None and spec.loader is not None
-strong = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(strong)
-PLACE, THREAT, ZOO, _always, _recorded = strong.PLACE, strong.THREAT, strong.ZOO, strong.always, strong.recorded
+from . import strong
+from .strong import PLACE, THREAT, ZOO
+from .strong import always as _always
+from .strong import recorded as _recorded
+
 half_place = strong.half_place
 
 

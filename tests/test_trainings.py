@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import importlib.util
 import multiprocessing
 import os
 import signal
@@ -17,10 +16,8 @@ from tailgate import cli
 from tailgate.base.errors import InputError, Killed
 from tailgate.training import adaptive, train
 
-spec = importlib.util.spec_from_file_location("dying", Path(__file__).with_name("dying.py"))
-assert spec is not None and spec.loader is not None
-dying = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(dying)
+from . import dying
+
 LONG = 100_000_000
 
 

@@ -1,6 +1,5 @@
 """The matrix of transfer: trained on one defence, played on others."""
 
-import importlib.util
 import json
 import math
 from pathlib import Path
@@ -16,11 +15,11 @@ from tailgate.studies.figures import transfer_figure
 from tailgate.studies.policies import mean, trained
 from tailgate.studies.transfer import _registered, difference, transfer
 
-spec = importlib.util.spec_from_file_location("strong", Path(__file__).with_name("strong.py"))
-assert spec is not None and spec.loader is not None
-strong = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(strong)
-THREAT, ZOO, _always, _recorded = strong.THREAT, strong.ZOO, strong.always, strong.recorded
+from . import strong
+from .strong import THREAT, ZOO
+from .strong import always as _always
+from .strong import recorded as _recorded
+
 brief_place, half_place = strong.brief_place, strong.half_place
 
 

@@ -14,7 +14,7 @@ import shlex
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from safetensors.numpy import save as save_tensors
@@ -35,7 +35,6 @@ from tailgate.envs.gym.observations import FRAMES, ObservationCodec
 FORMAT = "tailgate-policy-1"
 SOME = 8  # names in an error, at most
 LONGEST = 500  # characters of options in an error, at most
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,7 +28,7 @@ def chosen(brief: Brief, names: tuple[str, ...], default: Array, agents: tuple[i
 
 
 def require(brief: Brief, attack: str, kinds: Iterable[str] = (), target: Array | None = None) -> None:
-    """Raise NotApplicable unless the threat model grants every one of `kinds` and the wires of `target` (w,)."""
+    """Raise NotApplicable unless the threat model grants every one of `kinds` and the wires of `target` (N, w)."""
     threat = brief.threat
     for kind in kinds:
         if kind not in threat.kinds:

@@ -16,7 +16,7 @@ from tailgate.agents.scripts.radio import on_receivers
 from tailgate.agents.scripts.triggers import TRIGGERS, Timing, Trigger, TriggerState, idle, part, rearm
 from tailgate.agents.scripts.values import TAGS, Law, PerWire, check_wires, law_of
 from tailgate.base.errors import InputError, NotApplicable, unknown
-from tailgate.base.pytree import map_leaves
+from tailgate.base.pytree import map_leaves, widened
 from tailgate.core import AIRED, Array, Command, Count, Kind, PositiveCount, Probability, View, no_command, param
 from tailgate.core.draws import Draws
 from tailgate.core.kinds import EFFECTS, KindName
@@ -161,8 +161,8 @@ class Program:
             on = on & here & view.allowed & target.any(axis=(1, 2))
             value = 0.0 if law is None else fit(brief, ready.kind, law.sample(brief, count, draws, FIRST))
             part = brief.command(on, ready.kind, target, value)
-            command = Command(*(np.where(_rows(here, new), new, old) for new, old in zip(part, command, strict=True)))
-            trigger = map_leaves(lambda new, old, here=here: np.where(_rows(here, new), new, old), now, trigger)
+            command = Command(*(np.where(widened(here, new), new, old) for new, old in zip(part, command, strict=True)))
+            trigger = map_leaves(lambda new, old, here=here: np.where(widened(here, new), new, old), now, trigger)
             attacked = attacked + on
             ended = ready.trigger.over(now, view.k)
             if ready.phase.length is not None:
@@ -178,11 +178,6 @@ class Program:
         rounds = state.rounds + (over & (phase == len(plan.phases)))
         again = over & (phase == len(plan.phases)) & (rounds < plan.repeat)
         return ProgramState(np.where(again, 0, phase), rounds, np.where(over, 0, state.attacked), rearm(state.trigger, over))
-
-
-def _rows(mask: Array, leaf: Array) -> Array:
-    """Return mask (B,) in the shape of a leaf (B, ...)."""
-    return mask.reshape(-1, *(1,) * (leaf.ndim - 1))
 
 
 def _ready(phase: Phase, brief: Brief, where: str) -> Ready:

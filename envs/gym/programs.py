@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from tailgate.base.pytree import leaves, map_leaves
+from tailgate.base.pytree import leaves, map_leaves, widened
 from tailgate.core import draws
 from tailgate.core.draws import Keys
 from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
@@ -146,7 +146,7 @@ def _renewed(seat: Seat, state: Episodes, keys: Keys, again: Array) -> Episodes:
     """Return the state with the next episode in the rows `again`."""
     loop = seat.loop.start(Keys(keys.key, keys.episode + np.uint32(1)))
     fresh = Episodes(loop, seat.begin(loop))
-    return map_leaves(lambda old, new: np.where(again.reshape(len(again), *(1,) * (old.ndim - 1)), new, old), state, fresh)
+    return map_leaves(lambda old, new: np.where(widened(again, old), new, old), state, fresh)
 
 
 def _shown(seat: Seat, state: Episodes) -> dict[str, Array]:

@@ -38,7 +38,7 @@ class KalmanPlan(NamedTuple):
     C: Array  # (N, q, n)
     Q: Array
     R: Array  # (N, q, q)
-    broad: Array  # (n,) variances of a filter that has forgotten
+    broad: Array  # (n,) variances of a filter that has forgotten; the same for all agents
     held: Array | None = None  # (N, n, n) P- of the steady filter
 
 

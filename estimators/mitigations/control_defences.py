@@ -201,7 +201,6 @@ class OwnLoop(NamedTuple):
     forced: Array  # (4,)
     ahead: Array  # (4,)
     noisy: Array  # (4, 3)
-    feedback: Array  # (4,) of the command on z
 
 
 @register(
@@ -245,7 +244,7 @@ class InputClip(OwnSensors):
         feedback = np.array([*read, -rate])
         noisy = u[:, None] * read
         noisy[3, 0] += smooth
-        return OwnLoop(A + u[:, None] * feedback, u, np.array([1.0, 0.0, 0.0, 0.0]), noisy, feedback)
+        return OwnLoop(A + u[:, None] * feedback, u, np.array([1.0, 0.0, 0.0, 0.0]), noisy)
 
     def slack(self, own: OwnLoop, dt: float) -> float:
         """Return how far [m] the gap can fall below d_r behind a car with any speed in [0, speed_max], without noise and deviation."""

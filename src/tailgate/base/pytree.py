@@ -77,9 +77,9 @@ def leaves(tree: object, prefix: str = "") -> dict[str, Array]:
     return {prefix[:-1]: cast(Array, tree)}
 
 
-def with_leaves(tree: T, values: dict[str, Array], prefix: str = "") -> T:
+def with_leaves(tree: T, values: dict[str, Array]) -> T:
     """Return the tree with its leaves replaced by name, as `leaves` names them; their memory layout is kept."""
-    names = iter(leaves(tree, prefix))
+    names = iter(leaves(tree))
 
     def put(leaf: Array) -> Array:
         out = leaf.copy(order="K")
@@ -87,6 +87,11 @@ def with_leaves(tree: T, values: dict[str, Array], prefix: str = "") -> T:
         return out
 
     return map_leaves(put, tree)
+
+
+def widened(mask: Array, leaf: Array) -> Array:
+    """Return a mask (B, ...) with axes of length one behind it, as many as the leaf has more."""
+    return mask.reshape(*mask.shape, *(1,) * (leaf.ndim - mask.ndim))
 
 
 def lock(plan: T) -> T:

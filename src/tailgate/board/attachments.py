@@ -320,7 +320,7 @@ class Attachments(NamedTuple):
         return cls(Clock.of(board), Timing.of(board), Errata.of(board), Run.of(board), EqualGap.of(board))
 
     def belonging(self, board: Board) -> Attachments:
-        """Return what is of this board. Raises InputError for an attachment of another suite."""
+        """Return what is of this board. Raises InputError for one of another suite, and for some of another hash."""
         errata = self.errata and self.errata.belongs(board)
         return Attachments(
             self.clock and self.clock.belongs(board), self.timing and self.timing.belongs(board), errata,

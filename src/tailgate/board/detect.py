@@ -67,7 +67,7 @@ def _detected(path: Path, suite: Suite, defences: Sequence[str], effort: Effort,
         raise InputError("detection: plants", told, wanted)
     names = list(defences) or own
     asked = [defence for defence in names if not _whole(held, defence, suite, attacks, effort)]
-    part = [defence for defence in names if defence not in asked and not _checked(held, defence, suite)]
+    part = [defence for defence in names if defence not in asked and not _checked(held, defence)]
     there = {defence: _of(board, held, defence) for defence in part}
     with contextlib.closing(_play(suite, asked, attacks, effort, board["suite"].get("beacon") or "", workers, progress, there)) as played:
         for defence, found in played:
@@ -117,7 +117,7 @@ def _of(board: Data, held: Data, defence: str) -> Data:
     return {part: [line for line in held.get(part, ()) if line["defence"] == defence] for part in DETECTION} | {"stealth": stealth}
 
 
-def _checked(held: Data, defence: str, suite: Suite) -> bool:
+def _checked(held: Data, defence: str) -> bool:
     """Return if false alarms at all thresholds of an entry are there, or nothing is."""
     wanted = {(line["scenario"], line["hours"]) for line in held["entries"] if line["defence"] == defence}
     return wanted <= {(line["scenario"], line["hours"]) for line in held.get("alarms", ()) if line["defence"] == defence}

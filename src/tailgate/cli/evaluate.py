@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 DEFAULT = "quick-v0"  # the suite if none is named
 AGAIN = 3  # rows of a defence that are played again
+MANY_REFUSED = 0.1  # share of an attack's commands that is worth a warning
 REFUSED = "refused: the scenario does not grant it"
 
 
@@ -87,7 +89,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     attacked = [row for row in rows if row["attack"] != "none" and row["status"] == "ok"]
     if attacked and not any(row["attack_steps"] for row in attacked):
         tell("no attack took place in any episode: --attack names others, --threat grants more")
-    for warning in (*_above(rows, options.attack or ()), *_dependent(rows)):
+    for warning in (*_above(rows, options.attack or ()), *_refused(rows), *_dependent(rows)):
         tell(f"warning: {warning}")
     idle = bool(rows) and all(entry["crash"] is None for entry in table)
     if idle and not failed:
@@ -109,6 +111,22 @@ def _above(rows: list[dict[str, Any]], named: Sequence[str]) -> list[str]:
                 if not bound[0] <= getattr(made, field.name) <= bound[1]:
                     out.append(f"{attack}: {field.name} is cut at {field.metadata['cut']}, {bound[0]:g} to {bound[1]:g}")
     return out
+
+
+def _refused(rows: list[dict[str, Any]]) -> list[str]:
+    """Return warnings on attacks that act, but often ask for what the threat model does not grant, or no longer."""
+    tried: dict[tuple[str, str], Counter[str]] = {}
+    for row in rows:
+        if row["status"] == "ok":
+            tried.setdefault((row["attack"], row["scenario"]), Counter()).update({
+                "steps": row["attack_steps"], "refused": row["refused_commands"],
+            })  # fmt: skip
+    return [
+        f"{attack} in {scenario}: {count['refused'] / count.total():.0%} of its commands are refused: "
+        "the threat model does not grant them, or no longer"
+        for (attack, scenario), count in tried.items()
+        if count["steps"] and count["refused"] > MANY_REFUSED * count.total()
+    ]
 
 
 def _dependent(rows: list[dict[str, Any]]) -> list[str]:

@@ -1,14 +1,15 @@
 """Base classes of the components that a scenario and a leaderboard put together.
 
-A component is a frozen dataclass; its fields are its parameters. It owes a few methods, which are pure:
+A component is a frozen dataclass; its fields are its parameters. It owes a few methods, which keep nothing between calls:
 
 * `prepare` computes constants once, the plan (no batch axis);
 * `start` makes the state of B episodes: a NamedTuple in which every leaf has B first, or None;
-* `step`, `decide`, `measure` and the like return the next state. They may write into the state that they were given, and keep nothing.
+* `step`, `decide`, `measure` and the like return the next state. They may write into the state that they were given.
 
-P is the type of the plan, S that of the state. Axes: B episodes, N agents, n states, m inputs, q sensors per agent, p V2V fields,
-w = q + p + m wires. All arrays are float64 in SI units unless a sentence says otherwise. `draws` are the random numbers of the component's
-own role: the same seed gives the same numbers, whatever the batch.
+P is the type of the plan, S that of the state. Axes: B episodes, N agents, n states, m actuators, q sensors per agent, p V2V fields, w = q
++ p + m wires. The model's inputs are the actuators, or what a plant tells of itself, as the own speed of a car with a radar. All arrays
+are float64 in SI units unless a sentence says otherwise. `draws` are the random numbers of the component's own role: the same seed gives
+the same numbers, whatever the batch.
 """
 
 from __future__ import annotations
@@ -227,12 +228,12 @@ class Defence(Protocol[P, S]):
 
 
 class WhiteBox(NamedTuple, Generic[P, S]):
-    """The defence as a white-box attacker holds it. Its step is pure, so that the attacker may look ahead."""
+    """The defence as a white-box attacker holds it. `look` changes nothing; a copy of the state may be stepped, to look ahead."""
 
     defence: Defence[P, S]
     plan: P
     state: S
-    known_u: Array  # (B, N, m) the known input since the last step
+    known_u: Array  # (B, N, inputs) the known input since the last step
 
 
 class View(NamedTuple):

@@ -19,7 +19,7 @@ import numpy as np
 
 from tailgate import num
 from tailgate.base.errors import InputError, NotApplicable
-from tailgate.base.pytree import duplicate, frozen, lock, map_leaves, put_rows
+from tailgate.base.pytree import duplicate, frozen, lock, map_leaves, put_rows, widened
 from tailgate.core import (
     Air,
     Array,
@@ -276,7 +276,7 @@ class Loop:
             if num.some(inside):  # the car drives by its altered law, whatever its own defence asks for
                 heard_by = state.controller, estimate, received.v2v, odometry
                 altered, own = self.controller.scaled(plan.controller, *heard_by, factors)
-                controller = map_leaves(lambda new, old: np.where(_like(inside, new), new, old), altered, controller)
+                controller = map_leaves(lambda new, old: np.where(widened(inside, new), new, old), altered, controller)
                 u = np.where(inside[..., None], own, u)
         channel, applied = Channel().actuate(plan.channel, channel, u)
         manoeuvre, plant, known = self._move(state.keys, state.k, state.manoeuvre, state.plant, applied, u)
@@ -333,8 +333,3 @@ class Loop:
         driven = applied if self.load == 1.0 else applied / self.load
         plant = self.plant.step(plan.plant, plant, driven, exo, keys.at(Role.PROCESS, k))
         return manoeuvre, plant, self.plant.known(plan.plant, applied if u is None else u, exo, plant)
-
-
-def _like(mask: Array, leaf: Array) -> Array:
-    """Return mask (B, N) in the shape of a leaf (B, N, ...)."""
-    return mask.reshape(*mask.shape, *(1,) * (leaf.ndim - 2))

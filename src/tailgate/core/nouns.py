@@ -1,4 +1,4 @@
-"""The nouns. Axes: B episodes, N agents, feature last; n states, m inputs, q sensors per agent, p V2V fields, w = q + p + m wires.
+"""The nouns. Axes: B episodes, N agents, feature last; n states, m actuators, q sensors per agent, p V2V fields, w = q + p + m wires.
 
 Three things are never mixed:
 

@@ -177,7 +177,7 @@ def congruent(A: Array, P: Array, Q: Array) -> Array:
 
 
 def predicted(A: Array, B: Array, c: Array, L: Array, merge: Array, heard: Array, x: Array, u: Array) -> Array:
-    """Return merge_i sum_j L_j (A x_j + B u_j + c) (B, N, n) over j in heard (N, N) bool, for x (B, N, n) and u (B, N, m)."""
+    """Return merge_i sum_j L_j (A x_j + B u_j + c) (B, N, n) over j in heard (N, N) bool, for x (B, N, n) and u (B, N, inputs)."""
     sent = constant_on(L, constant_on(A, x) + constant_on(B, u) + c)
     return constant_on(merge, np.stack([_heard(sent, 0.0, who) for who in structure(heard)], axis=1))
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol, cast
 
 import numpy as np
 
-from tailgate.base.pytree import map_leaves
+from tailgate.base.pytree import map_leaves, widened
 from tailgate.core import Array, Attack, Command, View
 from tailgate.core.draws import Draws, Keys
 from tailgate.core.kinds import EFFECTS, Kind
@@ -68,7 +68,7 @@ class Scripts:
         rows = memory.scripts.phases[0]
         if self.programs:
             second = memory.phase == 1
-            rows = Rows(*(np.where(_like(second, new), new, old) for old, new in zip(*memory.scripts.phases, strict=True)))
+            rows = Rows(*(np.where(widened(second, new), new, old) for old, new in zip(*memory.scripts.phases, strict=True)))
         scene, level, trigger = view.scene, rows.threshold[:, None], rows.trigger[:, None]
         holds = np.where(trigger == NEAR, scene.gap < level, trigger == 0)
         holds = np.where(trigger == FAST, scene.speed > level, holds)
@@ -97,11 +97,6 @@ class Scripts:
             phase, opened = phase + over, opened & ~over
             attacked, elapsed = np.where(over, 0, attacked), np.where(over, 0, elapsed)
         return Memory(memory.scripts, phase, attacked, opened, elapsed, np.array(scene.lead_speed)), command
-
-
-def _like(mask: Array, leaf: Array) -> Array:
-    """Return mask (B,) in the shape of a leaf (B, ...)."""
-    return mask.reshape(-1, *(1,) * (leaf.ndim - 1))
 
 
 def remembered(scripts: Sequence, agents: int) -> Memory:

@@ -392,7 +392,7 @@ def evaluate(
             guard, adversary = component("defence", defence)[2], component("attack", attack)[2]
             for scenario in named.scenarios:
                 for dose in named.doses:
-                    rest = named.seeds, purpose, 0, batch, named.threat | dict(threat or {}), beacon, own, given.get(scenario)
+                    rest = named.seeds, purpose, 0, batch, named.granted | dict(threat or {}), beacon, own, given.get(scenario)
                     rows += run_cell(Cell(named.name, scenario, dose, guard, adversary, *rest), defence, attack)
     if out is not None and len(rows) > sum(cell.seeds for cell in cells):
         write_atomic(Path(out), packed(rows, Path(out)))  # with the rows of objects

@@ -19,7 +19,6 @@ from tailgate.core.draws import Draws, Keys, Role
 from tailgate.core.loop import START, Loop
 
 ROLES = (Role.PRIOR, Role.MANOEUVRE)
-LAWS = ("normal", "uniform")
 EDGE = 1e-3  # quantiles that a search leaves out at either end
 Numbers = Mapping[tuple[int, str, int], Array]  # role, law, tag -> (B, *shape)
 

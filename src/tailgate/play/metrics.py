@@ -182,7 +182,7 @@ def final_error(trace: Trace) -> Array:
 
 @metric("s")
 def recovery_time(trace: Trace) -> Array:
-    """From the last attack step until all gap errors stay within 2 m; null without an attack, after a collision, or if it never does."""
+    """From the last attack step until every gap stays within 2 m of the desired one; null without an attack, a collision, or if never."""
     attacked = _attacked(trace)
     steps = np.arange(len(attacked))[:, None]
     last = np.max(np.where(attacked, steps, -1), axis=0)

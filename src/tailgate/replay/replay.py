@@ -25,6 +25,7 @@ from tailgate.core.loop import Loop, LoopState
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, list_scenarios, load_scenario
 from tailgate.core.schema import build
+from tailgate.core.spec_text import split_text
 from tailgate.core.threat import ThreatModel
 from tailgate.evaluation.cells import ENGINE
 from tailgate.play.metrics import measure
@@ -60,7 +61,7 @@ class Filter:
         """Return True for the same text, or for a file elsewhere with the same content and parameters."""
         if self.attack in (None, row["attack"]):
             return True
-        (head, params), (held, own) = _split(str(self.attack)), _split(row["attack"])
+        (head, params), (held, own) = split_text(str(self.attack)), split_text(row["attack"])
         is_file = Path(head).suffix == Path(held).suffix and Path(head).is_file() and params == own
         return is_file and bool(row["attack_digest"]) and _digest_of(str(self.attack)) == row["attack_digest"]
 
@@ -77,12 +78,6 @@ def _name_of(scenario: str) -> str:
 @cache
 def _digest_of(attack: str) -> str:
     return Spec("attack", attack).digest
-
-
-def _split(text: str) -> tuple[str, str]:
-    """Return head and parameters of a component's text."""
-    head, sep, tail = text.rpartition(":")
-    return (head, tail) if sep and "=" in tail else (text, "")
 
 
 @dataclass(frozen=True)
@@ -277,7 +272,7 @@ def _component(family: Literal["defence", "attack"], row: Row, named: str | None
             f"a registered name: a row must not import code. If you trust this class, name it yourself: --{family} '{row[family]}'",
         )  # fmt: skip
     spec = held if named is None else Spec(family, named)
-    head, _ = _split(spec.text)
+    head, _ = split_text(spec.text)
     if family == "attack" and Path(head).suffix in (".json", *YAML_ENDS) and not spec.imports and not Path(head).is_file():
         raise InputError("the row's attack", spec.text, "an existing file; give its present path: --attack FILE")
     return spec

@@ -201,7 +201,9 @@ def figures(played: Played, dt: float) -> dict[str, Any]:
     seen = counts & np.moveaxis(held.plant.seen, 0, 1)[1 : steps + 1]
     low, high = mean_time(onsets, hours)
     out: dict[str, Any] = {
-        "hours": hours, "pieces": len(held.length), "alarms": onsets, "alarms_per_hour": onsets / hours if hours else None,
+        "hours": hours, "pieces": len(held.length), "alarms": onsets,
+        "alarm_times": sorted(round(float(held.begin[r] + (k + 1) * dt), 6) for k, r in np.argwhere(rises)),
+        "alarms_per_hour": onsets / hours if hours else None,
         "alarms_per_hour_low": 0.0 if high is None else 1.0 / high, "alarms_per_hour_high": 1.0 / low if low else None,
         "alarm_share": float(alarm.sum() / max(1, counts.sum())), "gap_error": _rms(off[..., 0], counts),
         "speed_error": _rms(off[..., 1], counts), "largest_gap_error": float(np.max(np.abs(off[..., 0]), where=counts, initial=0.0)),

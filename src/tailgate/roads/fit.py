@@ -22,9 +22,10 @@ from tailgate.envs.vehicle import drive, lag
 SPEED, GAP = 0.3, 2.0  # errors that weigh alike [m/s], [m]: the targets on unseen windows
 PARAMETERS = ("headway", "gap_gain", "speed_gain", "tau")
 BOUNDS = ((0.3, 0.005, 0.01, 0.2), (2.2, 1.0, 2.0, 0.4))  # tau: what actuators of production cars take [s]
-BEGIN = (1.1, 0.1, 0.35, 0.3)
+BEGINS = ((1.1, 0.1, 0.35, 0.3), (0.8, 0.3, 0.8, 0.35), (1.0, 0.2, 0.15, 0.35), (0.9, 0.05, 0.6, 0.25))  # the cost has more than one low
+NEAR = 1.01  # times the best cost: a law that costs less fits about as well
 DELAYS = (0.0, 0.2, 0.4, 0.6, 0.8)  # candidates of the time from a reading to its effect [s], one for all cars
-MOST = 25  # evaluations of a fit
+MOST = 40  # evaluations of a fit
 
 
 class Windows(NamedTuple):
@@ -144,12 +145,25 @@ def _residuals(held: Windows, standstill: Array, delay: float, car: int | None) 
     return errors
 
 
-def fitted(held: Windows, standstill: Array, delay: float, car: int | None) -> tuple[Array, float]:
-    """Return the parameters (4,) of one car, or of one law for all cars, by least squares, and the cost."""
+class Fitted(NamedTuple):
+    """Parameters of one car, or of one law for all."""
+
+    x: Array  # (4,)
+    cost: float
+    near: Array  # (2, 4) the least and the greatest parameters of the fits, from all beginnings, that cost at most 1 % more
+
+
+def fitted(
+    held: Windows, standstill: Array, delay: float, car: int | None, begins: Sequence[tuple[float, ...]] = BEGINS[:1]
+) -> Fitted:  # fmt: skip
+    """Return the parameters of one car, or of one law for all cars, by least squares: the best of the fits from several beginnings."""
     from scipy.optimize import least_squares
 
-    found = least_squares(_residuals(held, standstill, delay, car), BEGIN, bounds=BOUNDS, x_scale=BEGIN, diff_step=1e-3, max_nfev=MOST)
-    return np.asarray(found.x), float(found.cost)
+    errors = _residuals(held, standstill, delay, car)
+    every = [least_squares(errors, begin, bounds=BOUNDS, x_scale=BEGINS[0], diff_step=1e-3, max_nfev=MOST) for begin in begins]
+    best = min(every, key=lambda found: float(found.cost))
+    near = np.array([found.x for found in every if found.cost <= NEAR * best.cost])
+    return Fitted(np.asarray(best.x), float(best.cost), np.stack([near.min(axis=0), near.max(axis=0)]))
 
 
 def rms(x: Array) -> float:
@@ -188,29 +202,36 @@ def fit(settings: Settings = Settings(), progress: Callable[[int, int], None] | 
     seen, unseen = windows_of(settings)
     standstill = standing_gaps(settings.traces[0][0])
     cars = seen.gap.shape[2]
-    tried: list[tuple[float, float, Array]] = []  # cost, delay, parameters of each car
+    tried: list[tuple[float, float]] = []  # cost, delay
     for done, delay in enumerate(settings.delays, 1):
-        rows = [fitted(seen, standstill, delay, car) for car in range(cars)]
-        tried.append((sum(cost for _, cost in rows), delay, np.stack([x for x, _ in rows])))
+        tried.append((sum(fitted(seen, standstill, delay, car).cost for car in range(cars)), delay))
         if progress is not None:
-            progress(done, len(settings.delays) + 1)
-    _, delay, each = min(tried, key=lambda held: held[0])
-    mean = np.full(cars, standstill.mean())
-    one = fitted(seen, mean, delay, None)[0]
+            progress(done, len(settings.delays) + 2)
+    _, delay = min(tried)
+    each = [fitted(seen, standstill, delay, car, BEGINS) for car in range(cars)]
     if progress is not None:
-        progress(len(settings.delays) + 1, len(settings.delays) + 1)
-    laws = {"each": (each, standstill), "one": (np.tile(one, (cars, 1)), mean)}
+        progress(len(settings.delays) + 1, len(settings.delays) + 2)
+    mean = np.full(cars, standstill.mean())
+    one = [fitted(seen, mean, delay, None, BEGINS)] * cars
+    if progress is not None:
+        progress(len(settings.delays) + 2, len(settings.delays) + 2)
+    found = ("each", each, standstill), ("one", one, mean)
+    laws = {name: (np.stack([part.x for part in parts]), gaps, parts) for name, parts, gaps in found}
     return {
         "format": "tailgate-fit-1", "traces": [list(part) for part in settings.traces], "window": settings.window, "dt": seen.dt,
         "delay": delay,
-        "delays": [{"delay": at, "cost": cost} for cost, at, _ in tried],
+        "delays": [{"delay": at, "cost": cost} for cost, at in tried],
         "windows": {"fit": seen.speed.shape[1], "unseen": unseen.speed.shape[1]}, "targets": {"speed": SPEED, "gap": GAP},
         "laws": {
             name: {
                 "cars": [
-                    {"car": i + 2, "standstill": float(gaps[i]), **dict(zip(PARAMETERS, map(float, rows[i]), strict=True))}
+                    {
+                        "car": i + 2, "standstill": float(gaps[i]), **dict(zip(PARAMETERS, map(float, rows[i]), strict=True)),
+                        "near": dict(zip(PARAMETERS, parts[i].near.T.tolist(), strict=True)),
+                    }
                     for i in range(cars)
                 ],
+                "cost": sum(part.cost for part in (parts if name == "each" else parts[:1])),
                 **{
                     where: {
                         "alone": errors_of(held, play(held, rows, gaps, delay, alone=True)),
@@ -220,7 +241,7 @@ def fit(settings: Settings = Settings(), progress: Callable[[int, int], None] | 
                     for where, held in (("fit", seen), ("unseen", unseen))
                 },
             }
-            for name, (rows, gaps) in laws.items()
+            for name, (rows, gaps, parts) in laws.items()
         },
         "measured": {where: {"gain": amplified(held.speed)} for where, held in (("fit", seen), ("unseen", unseen))},
     }  # fmt: skip

@@ -97,11 +97,12 @@ def read(source: str, format: str | None = None, choice: Choice = Choice()) -> l
 
 def _check_choice(kind: str, choice: Choice) -> None:
     """Raise InputError for an option that a format does not have."""
-    given = {"vehicle": choice.vehicle, "lead": choice.lead, "length": choice.length if choice.length != LENGTH else None}
-    for name, value in (given | {"map": choice.mapping or None}).items():
+    given: dict[str, Any] = {"vehicle": choice.vehicle, "lead": choice.lead, "length": choice.length if choice.length != LENGTH else None}
+    given["map"] = " ".join(f"{what}={column}" for what, column, _ in choice.mapping) or None
+    for name, value in given.items():
         if value is not None and name not in TAKES[kind]:
             wanted = f"none: of these options the format {kind} takes {' and '.join(f'--{other}' for other in TAKES[kind])}"
-            raise InputError(f"--{name}", " ".join(map("=".join, (part[:2] for part in value))) if name == "map" else value, wanted)
+            raise InputError(f"--{name}", value, wanted)
 
 
 def _kind(source: str, path: Path, choice: Choice) -> str:

@@ -69,8 +69,8 @@ class Recording:
 def checked(raw: Raw, where: str) -> Recording:
     """Return the recording on a uniform grid. Repairs are counted; what is not one of them is refused.
 
-    Repeated times are dropped (up to 1 %), missing or impossible readings are marked, and samples that jitter are interpolated. Lost samples
-    count as readings that did not arrive; a hole of more than 0.5 s ends a segment. Segments below 5 s are dropped.
+    Repeated times are dropped (up to 1 %), missing or impossible readings are marked, and samples that jitter are interpolated.
+    Lost samples count as readings that did not arrive. A hole of more than 0.5 s ends a segment; segments below 5 s are dropped.
 
     Raises
     ------

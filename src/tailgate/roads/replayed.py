@@ -17,7 +17,7 @@ from tailgate.core.draws import Draws, Keys, counted, keys
 from tailgate.core.loop import Loop
 from tailgate.core.threat import ThreatModel
 from tailgate.envs.controllers.adaptive_cruise import OneCar
-from tailgate.envs.controllers.radar_car import GAP, OWN_SPEED, STATES, kinematic
+from tailgate.envs.controllers.radar_car import STATES, radar_model
 from tailgate.envs.manoeuvres import Constant
 from tailgate.roads.recording import Recording, Segment
 
@@ -77,11 +77,7 @@ class Pieces:
         return 0.0
 
     def model(self, sensor: Sensor, controller: Controller) -> Model:
-        (names, C, R), (A, B), rows = sensor.matrices(self), kinematic(self.dt), np.eye(STATES)
-        return Model(
-            A=A, B=B, c=np.zeros(STATES), C=C, Q=np.diag(process_var(self.dt)), R=R, graph=np.eye(1, dtype=bool), dt=self.dt,
-            sensors=names, actuators=("acceleration",), gap=rows[[GAP]], speed=rows[[OWN_SPEED]],
-        )  # fmt: skip
+        return radar_model(self, sensor, self.dt, process_var(self.dt))
 
     def prepare(self, model: Model) -> RowsPlan:
         rows, samples = self.gap.shape

@@ -23,7 +23,7 @@ class Steady(NamedTuple):
 
 def steady_state(model: Model, agent: int = 0) -> Steady:
     """Return the steady-state filter of one agent on its own sensors. Raises LinAlgError where none exists."""
-    from scipy.linalg import solve_discrete_are  # takes long to import, and most attacks do without
+    from scipy.linalg import solve_discrete_are  # takes long to import
 
     C, R = model.C[agent], model.R[agent]
     return updated(solve_discrete_are(model.A.T, C.T, model.Q, R), C, R)
