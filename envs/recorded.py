@@ -1,7 +1,8 @@
 """Recorded leaders: each episode drives another window of a recording, and no second serves two purposes of seeds.
 
-That holds for one step and one length of block: blocks are counted in steps. A recording is cut into blocks. The purposes of seeds own them in turn: train, report, select, tune, calibrate, train, ... An episode's
-window begins at a random step of a block of its purpose and ends in the same block.
+A recording is cut into blocks, counted in steps: the rule holds for one step and one length of block. The purposes of seeds own the blocks
+in turn: train, report, select, tune, calibrate, train, ... An episode's window begins at a random step of a block of its purpose and ends
+in the same block.
 """
 
 import math

@@ -9,10 +9,10 @@ import pytest
 
 import tailgate
 from tailgate.agents.optimal.optimal_stealth import farthest_inside
+from tailgate.agents.optimal.schedules import Filtering, Grid, Holding, Rules, best_holds, best_losses, farthest, reach, stealth_programme
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Kind
 from tailgate.core.draws import keys
-from tailgate.core.optimal import Filtering, Grid, Holding, Rules, best_holds, best_losses, farthest, reach, stealth_programme
 from tailgate.core.registry import entries
 from tailgate.core.scenario import load_scenario
 from tailgate.core.threat import ThreatModel

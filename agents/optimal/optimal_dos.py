@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from tailgate import num
+from tailgate.agents.optimal.schedules import Filtering, Objective, Rules, best_losses
 from tailgate.agents.scripts.aim import chosen, require
 from tailgate.agents.scripts.scripted import Script, ScriptPlan
 from tailgate.base.errors import NotApplicable
 from tailgate.core import Array, Command, Kind, Model, Positive, View, param
 from tailgate.core.draws import Draws
-from tailgate.core.optimal import Filtering, Objective, Rules, best_losses
 from tailgate.core.registry import register
 from tailgate.core.threat import Brief
 from tailgate.estimators.filters.kalman import steady_state

@@ -7,11 +7,11 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from tailgate.agents.optimal.schedules import Grid, Holding, HoldTable, Objective, Rules, best_holds
 from tailgate.agents.scripts.aim import chosen, require
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Command, Finite, Kind, Positive, PositiveCount, View, param
 from tailgate.core.draws import Draws
-from tailgate.core.optimal import Grid, Holding, HoldTable, Objective, Rules, best_holds
 from tailgate.core.registry import register
 from tailgate.core.threat import Brief
 from tailgate.envs.plants.scalar import WIRE, StateFeedback

@@ -9,12 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from tailgate import num
+from tailgate.agents.optimal.schedules import farthest
 from tailgate.agents.scripts.aim import chosen, require
 from tailgate.agents.scripts.scripted import Script, ScriptPlan
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Command, Finite, Kind, Positive, View, param
 from tailgate.core.draws import Draws
-from tailgate.core.optimal import farthest
 from tailgate.core.registry import register
 from tailgate.core.threat import Brief
 from tailgate.estimators.filters.kalman import steady_state

@@ -8,7 +8,6 @@ from functools import lru_cache
 import numpy as np
 
 from tailgate.core import Array, Frame
-from tailgate.core.drawing import edges, layout
 from tailgate.core.loop import Loop, LoopState
 from tailgate.envs.render.canvas import (
     ATTACK,
@@ -26,6 +25,7 @@ from tailgate.envs.render.canvas import (
     ended_line,
     header,
 )
+from tailgate.envs.render.graph import edges, layout
 
 SPLIT = 560.0  # column [px] between the graph and the bars
 DECADES = (-3, 4)  # range of the shade and the bars

@@ -10,7 +10,7 @@ from types import ModuleType
 
 ROOMS = {
     "base": "assets errors files interrupts lazy locks plots pool progress reading sizes sources machine=provenance tree=pytree",
-    "core": "drawing draws kinds loop optimal quantities reach registry scenario schema threat link=lossy_link watch=score_threshold",
+    "core": "draws kinds loop quantities reach registry scenario schema threat link=lossy_link watch=score_threshold",
     "engine": "hints",
     "evaluation": "calibrate golden rounds rows stats summary verify "
     "clean=attack_free held_out=excluded_attacks parts=resume rivals=baselines",
@@ -45,6 +45,10 @@ PACKAGES = {
     "commands": "cli", "reproduce": "thesis", "strength": "studies", "submission": "sandbox", "leaderboard": "board", "scoring": "board",
 }  # fmt: skip
 OTHERS = {
+    "drawing": "envs.render.graph",
+    "core.drawing": "envs.render.graph",
+    "optimal": "agents.optimal.schedules",
+    "core.optimal": "agents.optimal.schedules",
     "agents.codec": "envs.gym.actions",
     "agents.observation": "envs.gym.observations",
     "agents.reward": "envs.gym.rewards",

@@ -133,8 +133,8 @@ def _trace_table(group: list[dict[str, Any]]) -> None:
 
 
 def _draw(options: argparse.Namespace) -> int:
-    from tailgate.core.drawing import draw_graph, edges
     from tailgate.core.scenario import load_scenario
+    from tailgate.envs.render.graph import draw_graph, edges
 
     scenario = load_scenario(options.graph)
     brief = scenario.brief()

@@ -9,8 +9,8 @@ import numpy as np
 
 from tailgate.base.errors import InputError
 from tailgate.core import AIRED, Array, Kind, Mode
-from tailgate.core.drawing import edges, hops, layout
 from tailgate.core.kinds import EFFECTS
+from tailgate.envs.render.graph import edges, hops, layout
 
 from .replay import Replay, threshold
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from tailgate.base.plots import canvas
 from tailgate.core import Array
-from tailgate.core.drawing import graph_figure
 from tailgate.core.scenario import load_scenario
+from tailgate.envs.render.graph import graph_figure
 
 from .ch5_cases import COMPROMISED, DEFENCES, ONSET, SCENARIO, Runs
 from .claims import Drawing

@@ -7,8 +7,8 @@ from functools import partial
 
 from tailgate.base.plots import canvas
 from tailgate.core import Array
-from tailgate.core.drawing import graph_figure
 from tailgate.core.scenario import load_scenario
+from tailgate.envs.render.graph import graph_figure
 
 from .ch6_cases import CASES, DEFENCES, ONSET, SCENARIO, VICTIM, Runs
 from .claims import Drawing
