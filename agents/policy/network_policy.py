@@ -8,7 +8,6 @@ the policy was made.
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import shlex
 from dataclasses import dataclass
@@ -17,15 +16,13 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
-from safetensors.numpy import save as save_tensors
 
 from tailgate import num
 from tailgate.agents.policy.granted import remedy
 from tailgate.base.errors import InputError
-from tailgate.base.files import write_atomic
 from tailgate.core import Array, Command, PositiveCount, View, param
 from tailgate.core.draws import Draws, Role
-from tailgate.core.neural import Lstm, Memory, Network, pair, perceptron, read_trained
+from tailgate.core.neural import Lstm, Memory, Network, layers_of, pair, perceptron, read_trained, write_trained
 from tailgate.core.registry import register
 from tailgate.core.schema import as_data
 from tailgate.core.threat import Brief, Knowledge
@@ -88,21 +85,14 @@ def choose(
 
 def save_policy(path: Path, network: Network, header: dict[str, Any]) -> Path:
     """Write PATH.safetensors and PATH.json; `header` holds the other fields of `Header`: action, observation, knowledge and so on."""
-    tensors: dict[str, Array] = {}
-    for i, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
-        tensors |= {f"layer{i}.weight": np.ascontiguousarray(weight), f"layer{i}.bias": np.ascontiguousarray(bias)}
+    tensors = layers_of(network.weights, network.biases)
     if network.log_std is not None:
-        tensors["log_std"] = np.ascontiguousarray(network.log_std)
+        tensors["log_std"] = network.log_std
     kind: dict[str, Any] = {"squashed": True} if network.squashed else {}
     if network.lstm is not None:
-        tensors |= {"lstm.weight": np.ascontiguousarray(network.lstm.weight), "lstm.bias": np.ascontiguousarray(network.lstm.bias)}
+        tensors |= {"lstm.weight": network.lstm.weight, "lstm.bias": network.lstm.bias}
         kind["recurrent"] = True
-    blob = save_tensors(tensors)
-    file = path.with_suffix(".safetensors")
-    data = {"format": FORMAT, "tensors": file.name, "sha256": hashlib.sha256(blob).hexdigest(), "layers": len(network.weights)}
-    write_atomic(file, blob)
-    write_atomic(path.with_suffix(".json"), json.dumps(data | kind | as_data(header), indent=1).encode() + b"\n")
-    return path.with_suffix(".json")
+    return write_trained(path, FORMAT, tensors, len(network.weights), kind | as_data(header))
 
 
 def load_policy(path: Path) -> tuple[Header, Network]:

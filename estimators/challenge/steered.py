@@ -8,8 +8,6 @@ any other: every evaluation, learner and page takes it.
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,14 +15,12 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
-from safetensors.numpy import save as save_tensors
 
 from tailgate import num
 from tailgate.base.errors import InputError, NotApplicable, unknown
-from tailgate.base.files import write_atomic
 from tailgate.core import Array, Count, Estimate, Model, PositiveCount, Prior, Received, param
 from tailgate.core.draws import Draws
-from tailgate.core.neural import Network, perceptron, read_trained
+from tailgate.core.neural import Network, layers_of, perceptron, read_trained, write_trained
 from tailgate.core.registry import entries, entry_for, register
 from tailgate.core.schema import as_data, build
 from tailgate.estimators.challenge.steering import Hand, HandPlan, HandState, Memory, Menu, Sight, settings
@@ -52,15 +48,9 @@ class Header:
 
 def save_defender(path: Path, network: Network, header: dict[str, Any]) -> Path:
     """Write PATH.safetensors and PATH.json; `header` holds the other fields of `Header`: defence, menu, observation, training."""
-    tensors: dict[str, Array] = {}
-    for i, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
-        tensors |= {f"layer{i}.weight": np.ascontiguousarray(weight), f"layer{i}.bias": np.ascontiguousarray(bias)}
-    blob, file = save_tensors(tensors), path.with_suffix(".safetensors")
     menu = {key: value for key, value in as_data(header["menu"]).items() if key != "class"}
-    data = {"format": FORMAT, "tensors": file.name, "sha256": hashlib.sha256(blob).hexdigest(), "layers": len(network.weights)}
-    write_atomic(file, blob)
-    write_atomic(path.with_suffix(".json"), json.dumps(data | as_data(header) | {"menu": menu}, indent=1).encode() + b"\n")
-    return path.with_suffix(".json")
+    tensors = layers_of(network.weights, network.biases)
+    return write_trained(path, FORMAT, tensors, len(network.weights), as_data(header) | {"menu": menu})
 
 
 def load_defender(path: Path) -> tuple[Header, Network]:

@@ -4,7 +4,7 @@ import difflib
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from functools import wraps
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -97,6 +97,24 @@ def wanted(found: Mapping[str, Any]) -> str:
 def unknown(field: str, name: object, known: Iterable[str]) -> InputError:
     """Return an InputError for an unknown name: it suggests the nearest known name and lists them all."""
     return InputError(field, name, _among(name, sorted(known)))
+
+
+class Named(Protocol):
+    """A part of something, with a name."""
+
+    @property
+    def name(self) -> str: ...
+
+
+N = TypeVar("N", bound=Named)
+
+
+def by_name(field: str, name: str, parts: Iterable[N]) -> N:
+    """Return the part of this name; raise the InputError of `unknown` if there is none."""
+    held = {part.name: part for part in parts}
+    if name not in held:
+        raise unknown(field, name, held)
+    return held[name]
 
 
 def _among(name: object, names: list[str]) -> str:

@@ -6,17 +6,20 @@ No sum depends on the batch, and so no trace does. Reading a file executes nothi
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from safetensors.numpy import load as load_tensors
+from safetensors.numpy import save as save_tensors
 
 from tailgate import num
 from tailgate.base.errors import InputError, said
+from tailgate.base.files import write_atomic
 from tailgate.base.reading import TENSORS, load_json, read_bytes, tensors_of
 from tailgate.core.nouns import Array
 from tailgate.core.schema import build
@@ -127,6 +130,20 @@ def read_trained(kind: type[T], form: str, path: Path, field: str, where: str) -
         return header, tensors_of(blob, load_tensors)[0]
     except ValueError as error:
         raise InputError(f"{where}.tensors", header.tensors, f"a safetensors file ({error})") from None
+
+
+def write_trained(path: Path, form: str, tensors: Mapping[str, Array], layers: int, header: dict[str, Any]) -> Path:
+    """Write PATH.safetensors and PATH.json, as `read_trained` reads them; return the latter. header: what it holds besides."""
+    blob, file = save_tensors({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}), path.with_suffix(".safetensors")
+    data = {"format": form, "tensors": file.name, "sha256": hashlib.sha256(blob).hexdigest(), "layers": layers}
+    write_atomic(file, blob)
+    write_atomic(path.with_suffix(".json"), json.dumps(data | header, indent=1).encode() + b"\n")
+    return path.with_suffix(".json")
+
+
+def layers_of(weights: Sequence[Array], biases: Sequence[Array]) -> dict[str, Array]:
+    """Return the tensors of a perceptron by name, as `perceptron` reads them."""
+    return {f"layer{i}.{name}": part[i] for i in range(len(weights)) for name, part in (("weight", weights), ("bias", biases))}
 
 
 def perceptron(tensors: dict[str, Array], layers: int, width: int, where: str) -> tuple[tuple[Array, ...], tuple[Array, ...]]:

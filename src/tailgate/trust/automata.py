@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-from tailgate.base.errors import InputError, unknown
+from tailgate.base.errors import InputError, by_name, unknown
 from tailgate.core import Finite, NonNegative, Positive, param
 from tailgate.core.scenario import config_path
 from tailgate.core.schema import build, read_yaml
@@ -89,10 +89,7 @@ class Component:
 
     def location(self, name: str) -> Location:
         """Raise InputError for a name that does not exist."""
-        for location in self.locations:
-            if location.name == name:
-                return location
-        raise unknown(f"component {self.name}: location", name, [location.name for location in self.locations])
+        return by_name(f"component {self.name}: location", name, self.locations)
 
 
 @dataclass(frozen=True)
@@ -137,17 +134,11 @@ class Network:
 
     def component(self, name: str) -> Component:
         """Raise InputError for a name that does not exist."""
-        for c in self.components:
-            if c.name == name:
-                return c
-        raise unknown(f"network {self.name}: component", name, [c.name for c in self.components])
+        return by_name(f"network {self.name}: component", name, self.components)
 
     def query(self, name: str) -> Query:
         """Raise InputError for a name that does not exist."""
-        for q in self.queries:
-            if q.name == name:
-                return q
-        raise unknown(f"network {self.name}: query", name, [q.name for q in self.queries])
+        return by_name(f"network {self.name}: query", name, self.queries)
 
     def with_location(self, component: str, location: str, **changes: Any) -> Network:
         """Return the same network with other fields of one location."""

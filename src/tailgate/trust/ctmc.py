@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from tailgate.base.errors import InputError, NotApplicable, unknown
+from tailgate.base.errors import InputError, NotApplicable, by_name, unknown
 from tailgate.core import Array, NonNegative, Positive, param
 from tailgate.core.scenario import config_path
 from tailgate.core.schema import build, read_yaml
@@ -81,10 +81,7 @@ class Architecture:
 
     def message(self, name: str) -> Route:
         """Raise InputError for a name that does not exist."""
-        for one in self.messages:
-            if one.name == name:
-                return one
-        raise unknown(f"automata {self.name}: message", name, [one.name for one in self.messages])
+        return by_name(f"automata {self.name}: message", name, self.messages)
 
 
 def load_architecture(name: str) -> Architecture:
