@@ -29,7 +29,7 @@ def _made(windows=3, seconds=30.0, dt=0.1, delay=0.4):
 def test_the_law_that_made_the_data_is_found():
     held, costs = _made(), []
     for car in range(2):
-        x, cost = fits.fitted(held, np.array([4.0, 4.0]), 0.4, car)
+        x, cost, _ = fits.fitted(held, np.array([4.0, 4.0]), 0.4, car)
         assert (np.abs(x / TRUE[car] - 1.0) < [0.01, 0.06, 0.06, 0.15]).all() and cost < 1.0
         costs.append(cost)
     assert fits.fitted(held, np.array([4.0, 4.0]), 0.0, 0)[1] > 10.0 * costs[0]
@@ -79,7 +79,9 @@ def test_the_defaults_of_the_controller_are_the_fit_to_all_cars(tmp_path, capsys
     assert held == json.loads(capsys.readouterr().out) and (tmp_path / "fit.png").read_bytes().startswith(b"\x89PNG")
     law, found = make("controller", "acc_production"), held["laws"]["one"]["cars"][0]
     assert held["delay"] == law.delay
-    assert abs(found["gap_gain"] - law.gap_gain) < 0.01 and abs(found["speed_gain"] - law.speed_gain) < 0.01
+    for name in ("gap_gain", "speed_gain"):  # one of the laws that fit about as well
+        least, greatest = found["near"][name]
+        assert least - 0.005 < getattr(law, name) < greatest + 0.005 and least <= found[name] <= greatest
     assert abs(found["standstill"] - law.standstill) < 0.1
     unseen = held["laws"]["each"]["unseen"]
     assert np.mean(unseen["alone"]["gap"]) < 2.2 and np.mean(unseen["alone"]["speed"]) < 0.45
