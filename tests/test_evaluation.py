@@ -391,3 +391,10 @@ def test_rows_of_another_cell_end_a_run(tmp_path):
 
 def iter_of(*held):
     yield from held
+
+
+def test_a_suite_s_knowledge_reaches_objects_too() -> None:
+    suite = Suite("s", "", ("thesis-ch4-v0",), (5,), ("kf",), ("fdi",), 2, knowledge="grey")
+    named, held = (tailgate.evaluate(suite, defences=[defence]) for defence in ("kf", tailgate.make_defence("kf")))
+    assert all(one[name] == two[name] for one, two in zip(named, held, strict=True) for name in ("knowledge", "config_hash", "trace_hash"))
+    assert {row["knowledge"] for row in held} == {"grey"}
