@@ -205,6 +205,17 @@ def test_a_damaged_counterexample_is_refused(tmp_path, changes, expected):
         replayed(path)
 
 
+@pytest.mark.long
+def test_a_counterexample_of_a_suite_in_a_file_is_played_where_the_suite_is_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.yaml").write_text("about: a\nscenarios: [braking-v0]\ndoses: [5]\nshown: {5: a}\ndefences: [kf]\nattacks: [none]\nseeds: 3\n")
+    falsify(Search(dataclasses.replace(ROAD, suite="mine.yaml", formula="G[0,60] gap > 20"), trials=2), tmp_path / "out")
+    path = tmp_path / "out" / run.COUNTEREXAMPLE
+    with pytest.raises(InputError, match=r"counterexample: suite: got 'mine\.yaml'"):
+        replayed(path)
+    assert replayed(path, suite="mine.yaml")["same"]
+
+
 # The commands
 
 

@@ -15,7 +15,7 @@ from tailgate.estimators.filters.kalman import KalmanFilter
 from tailgate.estimators.parts import Detector, Filter, Mitigation, Verdict
 from tailgate.evaluation.stats import limits
 from tailgate.play.trace import Trace, rollout
-from tailgate.trust.informs import Informed, difference, informed
+from tailgate.trust.informs import INFORMS, Informed, difference, informed, informedness
 from tailgate.trust.run import check as trust
 
 
@@ -107,3 +107,11 @@ def test_trust_reports_informedness_next_to_detection() -> None:
     (alone,) = trust(replace(given, attacks=given.attacks[:2], defences=("chi2_kf",)))["defences"]
     assert alone["properties"][4]["share"]["k"] == alone["properties"][4]["share"]["n"] > 15 and alone["properties"][4]["earned"] > 0.55
     assert [p["name"] for p in trust(given, formulas=["F alarm"], runs=3)["defences"][0]["properties"]] == ["F alarm"]
+
+
+def test_the_cell_of_the_least_limit_counts() -> None:
+    """Ten runs that all inform prove less than 400 of which 380 do."""
+    cells = [{"scenario": name, "dose": 5, "attack": "fdi", INFORMS: {"asked": n, "attacked": k, "clean": 0}} for name, n, k in (("a", 400, 380), ("b", 10, 10))]
+    found = informedness(cells, 0.05)
+    assert found is not None and found["share"]["scenario"] == "b"
+    assert found["earned"] == difference(10, 0, 10, 0.025)["low"] < difference(380, 0, 400, 0.025)["low"]

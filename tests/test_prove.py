@@ -13,8 +13,9 @@ from tailgate.core import draws
 from tailgate.core.registry import Spec, make
 from tailgate.core.scenario import load_scenario
 from tailgate.play.trace import rollout
-from tailgate.trust.affine import AffineLoop, Step, affine_loop, probed
+from tailgate.trust.affine import AffineLoop, Step, affine_loop
 from tailgate.trust.leaders import accelerations
+from tailgate.trust.probing import probed
 from tailgate.trust.prove import admissible, closed_form, keeps, message_delay, prove, reacting
 from tailgate.trust.signals import SafeDistance
 from tailgate.trust.tube import Tube, quantile_of
@@ -111,8 +112,8 @@ def scalar(a, many):
 def test_the_radius_of_a_scalar_system_is_its_geometric_series():
     """A = 0.5, |w| <= 1: it tends to 2."""
     radius = Tube(scalar(0.5, 60)).wide["gap"][:, 0]
-    assert np.allclose(radius, 2.0 * (1.0 - 0.5 ** np.arange(1, 61)), rtol=1e-8) and radius[-1] == pytest.approx(2.0)
-    assert np.allclose(Tube(scalar(-0.9, 40)).wide["gap"][-1, 0], (1 - 0.9**40) / 0.1, rtol=1e-8)
+    assert np.allclose(radius, 2.0 * (1.0 - 0.5 ** np.arange(1, 62)), rtol=1e-8) and radius[-1] == pytest.approx(2.0)
+    assert np.allclose(Tube(scalar(-0.9, 40)).wide["gap"][-1, 0], (1 - 0.9**41) / 0.1, rtol=1e-8)
 
 
 def inside(tube, trace, size, gaps):
@@ -120,7 +121,7 @@ def inside(tube, trace, size, gaps):
     many = len(trace.control)
     wide = {name: tube.wide[name] + size * tube.pushed[name] for name in tube.wide}
     off = {
-        "gap": np.abs(gaps[..., None] - tube.gap_offset - tube.gap.centre[:many, None]) / wide["gap"][:many, None],
+        "gap": np.abs(gaps[..., None] - tube.gap_offset - tube.gap.centre[: len(gaps), None]) / wide["gap"][: len(gaps), None],
         "error": np.abs((trace.estimate - trace.truth)[:, :, 0] - tube.error.centre[:many, None]) / wide["error"][:many, None],
     }  # fmt: skip
     kept = np.ones(gaps.shape[1], bool)
@@ -153,7 +154,7 @@ def test_ten_thousand_runs_behind_a_leader_stay_inside_of_the_tube():
     trace = play(place, f"fdi_uniform:low={-size},high={size},start_step=20")
     assert not trace.collided.any() and trace.control.min() > -5.0 and trace.control.max() < 2.0
     tube = Tube(affine_loop(place, spread=6.0))
-    gap = np.concatenate([trace.first["gap"][None], trace.gap[:-1]])[:, :, 0]  # before the step, as the tube has it
+    gap = np.concatenate([trace.first["gap"][None], trace.gap])[:, :, 0]
     kept, used = inside(tube, trace, size, gap)
     assert kept == 1.0 and used > 0.1
 
@@ -201,12 +202,12 @@ def test_the_strongest_attack_of_the_tube_does_in_the_loop_what_the_tube_says(tm
     still = dataclasses.replace(place, truth=truth, manoeuvre=make("manoeuvre", "bend", value=0.0))
     loop = still.loop(Spec("defence", "kf").make())
     state, off = loop.start(draws.keys("tune", range(1))), 0.0
-    for step in range(1, k + 1):
-        off = float(loop.plant.truth(loop.plan.plant, state.plant, None)[0, 0, 0])
+    for step in range(1, k):
         on = step in values
         command = loop.brief.command(np.array([on]), 5, np.array([[[True, False, False, False, False]]]), values.get(step, 0.0))
         state, frame = loop.advance(state, command)
         assert not frame.refused.any()
+    off = float(loop.plant.truth(loop.plan.plant, state.plant, None)[0, 0, 0])
     assert len(steps) == 25 and abs(off) == pytest.approx(size * tube.pushed["gap"][k - 1].max(), rel=1e-4)
 
 
@@ -397,3 +398,47 @@ def test_the_command(capsys):
     assert "admissible bias" in " ".join(capsys.readouterr().out.split())
     assert cli.main(["trust", "--prove"]) == 2 and "--scenario" in capsys.readouterr().err
     assert cli.main(["trust", "--prove", "--scenario", "thesis-ch5-v0"]) == 1
+
+
+def test_the_gap_behind_the_last_step_is_covered():
+    """An attack of one step can move a gap only behind that step."""
+    tube = Tube(affine_loop(car(targets=("position",)), steps=1))
+    assert tube.lower_gap(0.0).shape == (2,) and tube.pushed["gap"][0, 0] == 0.0 < tube.pushed["gap"][1, 0]
+
+
+@pytest.mark.parametrize(("low", "high"), [(-5.0, None), (None, 2.0)])
+def test_a_controller_with_one_limit_keeps_it(low, high):
+    """One limit that is missing takes nothing from the other; fewer limits may prove more of their own side only."""
+    place = car()
+    one = dataclasses.replace(place.controller, accel_min=low, accel_max=high)
+    law = probed(one, place.brief().model)
+    assert (law.low[0], law.high[0]) == (-np.inf if low is None else low, np.inf if high is None else high)
+    rest = {"at_rest": True, "lead": (-0.1, 0.1), "steps": 60}
+    wide = dataclasses.replace(place.with_threat(targets=("position",), fdi_bound=50.0), controller=one)
+    both, single = (Tube(affine_loop(p, **rest)).largest(50.0) for p in (dataclasses.replace(wide, controller=place.controller), wide))
+    assert both <= single < Tube(affine_loop(wide, **rest)).largest(50.0, limits=False)
+
+
+def test_a_loop_at_rest_is_at_rest_behind_any_leader():
+    """He begins to drive at step 1: before, the gap is the desired one at a constant speed."""
+    place = car()
+    for lead in ((-3.0, 1.5), (0.0, 1.5)):
+        tube = Tube(affine_loop(place, at_rest=True, lead=lead, steps=3))
+        assert tube.gap.centre[0, 0] == pytest.approx(92.15, abs=1e-4) and tube.speed.centre[0, 0] == pytest.approx(29.05, abs=1e-4)
+    fine = dataclasses.replace(load_scenario("stop-and-go-fine-v0"), controller=place.controller)
+    assert Tube(affine_loop(fine, at_rest=True, steps=3)).speed.centre[0, 0] == pytest.approx(29.05, abs=1e-3)
+
+
+def test_a_controller_that_bends_and_a_plant_that_switches_are_refused():
+    place = load_scenario("lane-keeping-v0")
+    with pytest.raises(NotApplicable, match=r"controller.*LaneStanley.*linear between its limits"):
+        affine_loop(dataclasses.replace(place, controller=make("controller", "lane_stanley")))
+    with pytest.raises(NotApplicable, match=r"plant.*CarFollowingLiteral"):
+        affine_loop(load_scenario("thesis-ch4-literal-v0"))
+
+
+def test_what_a_proof_does_not_cover_is_told(capsys):
+    held = prove(CAR, set_speed=False, steps=20, threat={"kinds": ["fdi", "dos_jam"]})["attack"]
+    assert held["not_covered"] == ["dos_jam", "a car behind"]
+    assert cli.main(["trust", "--prove", "--scenario", LANE, "--steps", "5"]) == 0
+    assert "injected values alone are covered, and nothing of:" in " ".join(capsys.readouterr().out.split())

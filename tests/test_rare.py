@@ -79,6 +79,19 @@ def test_a_frequent_event_is_counted_as_plain_episodes_count_it():
     assert abs(np.mean(values) - share) < 4.0 * np.std(values) / math.sqrt(len(values))
 
 
+def test_a_near_certain_event_has_the_interval_of_plain_episodes():
+    """Runs that need no level are shares; equal ones had an interval of no width."""
+    sure = [Run(1.0, 0, 8, np.zeros((1, 8, 3), np.uint64), np.ones(8), 8)] * 3
+    chance = chance_of(sure, 8)
+    assert (chance.probability, chance.high) == (1.0, 1.0) and chance.low == pytest.approx(0.025 ** (1 / 24))
+    rng, kept = np.random.default_rng(4), 0
+    for _ in range(400):
+        counts = rng.binomial(16, 0.97, 8)
+        held = chance_of([Run(n / 16, 0, 16, np.zeros((1, 0, 3), np.uint64), np.zeros(0), int(n)) for n in counts], 16)
+        kept += held.low <= 0.97 <= held.high
+    assert kept > 0.95 * 400 - 3.0 * math.sqrt(0.05 * 0.95 * 400)
+
+
 def test_runs_that_do_not_arrive_give_an_upper_bound():
     none = [Run(0.0, 5, 100, np.zeros((1, 0, 3), np.uint64), np.zeros(0))] * 4
     chance = chance_of(none, 100)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from tailgate.base.errors import InputError
 from tailgate.trust.formula import parse
 from tailgate.trust.logic import (
+    TINY,
     Always,
     And,
     Atom,
@@ -36,7 +37,8 @@ def _worth(f: Formula, values: dict[str, list[float]], k: int, n: int, exact: bo
     most, least = (any, all) if exact else (lambda x: max([bottom, *x]), lambda x: min([top, *x]))
     if isinstance(f, Atom):
         margin = f.constant + sum(factor * values[name][k] for name, factor in f.terms)
-        return margin if not exact else margin > 0 if f.strict else margin >= 0
+        true = margin > 0 if f.strict else margin >= 0
+        return true if exact else margin or (TINY if true else -TINY)
     if isinstance(f, Not):
         inner = _worth(f.of, values, k, n, exact)
         return not inner if exact else -inner
@@ -68,10 +70,10 @@ def _formulas() -> st.SearchStrategy[Formula]:
 @st.composite
 def _episodes(draw: st.DrawFn) -> Samples:
     lengths = draw(st.lists(st.integers(1, 30), min_size=1, max_size=3))
-    # from 13 samples on no window of three nested operators begins behind the last
-    size = max(*lengths, 13)
+    size = max(lengths)
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    return Samples(DT, np.array(lengths), {name: rng.integers(-4, 5, (size, len(lengths))).astype(float) for name in "xy"})
+    values = {name: rng.integers(-4, 5, (size, len(lengths))).astype(float) for name in "xy"}
+    return Samples(DT, np.array(lengths), values, 13)  # a horizon in which windows of three nested operators begin
 
 
 def _depth(f: Formula) -> int:
@@ -88,7 +90,7 @@ def test_both_semantics_keep_to_their_definitions_and_agree_in_sign(formula: For
         values = {name: list(value[:, b]) for name, value in episodes.values.items()}
         assert found[b] == _worth(formula, values, 0, n, True)
         assert worth[b] == _worth(formula, values, 0, n, False)
-    assert found[worth > 0.0].all() and not found[worth < 0.0].any()
+    assert (found == (worth > 0.0)).all() and not (worth == 0.0).any()
     assert (holds(Not(formula), episodes) == ~found).all()
 
 
@@ -98,7 +100,7 @@ def test_an_episode_is_judged_by_its_own_samples(formula: Formula, episodes: Sam
     """Companions in the batch, and what stands behind an episode's end, would change its verdict."""
     for b in range(len(episodes.length)):
         alone = {name: np.where(episodes.live[:, b : b + 1], value[:, b : b + 1], 99.0) for name, value in episodes.values.items()}
-        one = Samples(DT, episodes.length[b : b + 1], alone)
+        one = Samples(DT, episodes.length[b : b + 1], {name: value[: episodes.length[b]] for name, value in alone.items()}, episodes.horizon)
         assert holds(formula, one)[0] == holds(formula, episodes)[b]
         assert robustness(formula, one)[0] == robustness(formula, episodes)[b]
 
@@ -182,3 +184,10 @@ def test_infinite_signals_are_compared_but_not_subtracted() -> None:
 def test_along_reads_a_formula_at_every_sample() -> None:
     """How often an antecedent held would be counted at other samples."""
     assert along(parse("x > 0 and F[0.1,0.1] x < 0"), _one(1.0, -1.0, 1.0, 1.0))[:, 0].tolist() == [True, False, False, False]
+
+
+def test_what_is_exactly_at_a_border_is_true_or_false() -> None:
+    """A car that halts breaks `speed > 0`, and keeps `speed >= 0`: by robustness as by truth."""
+    halted = Samples(DT, np.array([2]), {"speed": np.array([[3.0], [0.0]])})
+    for text, true in (("G speed > 0", False), ("G speed >= 0", True), ("F speed <= 0", True), ("F speed < 0", False), ("not (G speed > 0)", True)):
+        assert holds(parse(text), halted)[0] == true == (robustness(parse(text), halted)[0] > 0.0)

@@ -69,7 +69,7 @@ def _falsify(options: argparse.Namespace) -> int:
 
     own_classes()
     if options.counterexample is not None:
-        held = replayed(Path(options.counterexample), options.defence, options.scenario)
+        held = replayed(Path(options.counterexample), options.defence, options.scenario, options.suite)
         show(options, held, _print_replay)
         return 0 if held["same"] else 1
     options.kept = "the same command goes on" if options.out else "nothing is kept: --out DIR would"

@@ -100,8 +100,13 @@ def _print(found: list[dict[str, Any]]) -> None:
             budget = "unlimited" if held["budget"] is None else str(held["budget"])
             sizes = (_number(held[name], held["most"]) for name in ("largest", "without_limits"))
             line = (", ".join(held["targets"]), budget, *sizes, f"{held['calm']['gap']:.4g}")
-            heads = ("wires", "steps", "largest injection that is safe", "if the command had no limits", "least gap without an attack")
+            heads = (
+                "wires", "steps", "largest injection that is safe", "if the command had no limits", "least gap ahead without an attack",
+            )  # fmt: skip
             table(heads, [line], f"{report['scenario']}, kf: reachable sets over {held['steps']} steps", words)
+            if held["not_covered"]:
+                rest = ", ".join(held["not_covered"])
+                say(f"{report['scenario']}: injected values alone are covered, and nothing of: {rest}", soft_wrap=True)
         if (held := report.get("delay")) is not None:
             say(f"{report['scenario']}: a message may be late by {_number(held['largest'])} steps of {held['dt']:g} s (tried up to "
                 f"{held['tried'][-1]['delay']}), the limits of the command aside")  # fmt: skip

@@ -88,7 +88,7 @@ def _figures(case: Case, trace: Trace) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def replayed(path: Path, defence: str | None = None, scenario: str | None = None) -> dict[str, Any]:
+def replayed(path: Path, defence: str | None = None, scenario: str | None = None, suite: str = "") -> dict[str, Any]:
     """Play a counterexample again in the plain engine; return its figures, and `same`: if they are the file's.
 
     Parameters
@@ -99,6 +99,8 @@ def replayed(path: Path, defence: str | None = None, scenario: str | None = None
         Plays this defence instead of the file's; a class to import is played only if it is named here.
     scenario
         Plays in this scenario instead of the file's; a scenario file is read only if it is named here.
+    suite
+        Takes the threat model of this suite instead of the file's; a suite file is read only if it is named here.
 
     Raises
     ------
@@ -116,13 +118,13 @@ def replayed(path: Path, defence: str | None = None, scenario: str | None = None
             raise InputError(f"counterexample: {name}", data.get(name), "a text")
     if not isinstance(data.get("threat"), dict) or type(data.get("seed")) is not int or data["seed"] < 0:
         raise InputError("counterexample: threat, seed", [data.get("threat"), data.get("seed")], "a mapping, and a number not below 0")
-    for name, named, known in (("suite", "", ["", *list_suites()]), ("scenario", scenario, list_scenarios())):
+    for name, named, known in (("suite", suite, ["", *list_suites()]), ("scenario", scenario, list_scenarios())):
         if not named and data[name] not in known:
             raise unknown(f"counterexample: {name}", data[name], known)  # a file does not choose a file
     chosen, place = defence or data["defence"], scenario or data["scenario"]
     if defence is None:
         Spec("defence", chosen).refuse_imports("counterexample")
-    case = Case(data["suite"], place, data.get("dose"), chosen, tuple(data["threat"].items()), data["property"], "none")
+    case = Case(suite or data["suite"], place, data.get("dose"), chosen, tuple(data["threat"].items()), data["property"], "none")
     numbers = from_data(case.slots, data.get("start"), "counterexample: start")
     schedule = schedule_of(data.get("commands"), case.own.brief, "counterexample: commands")
     figures = _figures(case, _played(case, schedule, "none", data["seed"], numbers))

@@ -53,7 +53,8 @@ class Rare:
         """Return a digest of all that decides a part of the result."""
         one = self.case
         parts = [Spec("defence", one.defence).digest, Spec("attack", one.attack).digest, load_scenario(one.scenario).config_hash]
-        return digest([sources.own(), *parts, plain_data(one), self.particles if what == "run" else None, self.seed, what])
+        counts = self.particles if what == "run" else self.runs if what == "likeliest" else None
+        return digest([sources.own(), *parts, plain_data(one), counts, self.seed, what])
 
 
 def estimate(job: Rare, out: Path | None = None, progress: Progress | None = None, noise: bool = False) -> dict[str, Any]:

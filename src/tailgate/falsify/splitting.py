@@ -127,13 +127,13 @@ def chance_of(runs: list[Run], particles: int, confidence: float = 0.95) -> Chan
     """Return the mean of independent runs, with a two-sided interval.
 
     The estimates of runs are nearly log-normal, so the interval is Cox's for the mean of a log-normal, with Student's quantile (Olsson
-    2005). If a run did not arrive, they are too few and too skewed for that. Then the interval is the exact one of plain episodes, which
-    the first particles of all runs are: wide, but it holds.
+    2005). If a run did not arrive, they are too few and too skewed for that. If one needed no level, they are shares of plain episodes, and
+    near 1 far from log-normal. Then the interval is the exact one of plain episodes, which the first particles of all runs are.
     """
     values = np.array([run.probability for run in runs])
     mean, count = float(values.mean()), len(values)
     quantile = float(stdtrit(count - 1, 0.5 + 0.5 * confidence))
-    if not values.all():
+    if not values.all() or any(run.levels == 0 for run in runs):
         _, low, high = interval(sum(run.first for run in runs), particles * count, confidence)
     else:
         logs = np.log(values)

@@ -11,35 +11,30 @@ F, H and u0 are read off the controller by probing it, as is the range within wh
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass
+from math import ceil
 from typing import NamedTuple, TypedDict
 
 import numpy as np
 
 from tailgate.base.errors import InputError, NotApplicable
-from tailgate.core import Array, Controller, Estimate, Model
+from tailgate.core import Array, Model
 from tailgate.core.scenario import Scenario
 from tailgate.core.threat import Brief
 from tailgate.envs.controllers.adaptive_cruise import LEADER
+from tailgate.envs.plants.car_following import CarFollowing
+from tailgate.envs.plants.lane_keeping import LaneKeeping
+from tailgate.envs.plants.scalar import ScalarLoop
+from tailgate.envs.plants.sensor_network import SensorNetwork
 from tailgate.estimators.filters.kalman import steady_state
 from tailgate.trust.leaders import accelerations
+from tailgate.trust.probing import Law, probed
 
-SETTLE = 300  # steps before an episode that begins at rest
+SETTLE = (300, 30.0)  # steps and seconds before an episode that begins at rest, at least
+STILL = 1e-6  # by how much gap, speed and command may still change in a step after them [m], [m/s], [m/s^2]
 UNIFORM = 3.0**0.5  # standard deviations from the middle of a uniform law to its end
 SPREAD = 4.0  # standard deviations of noise that count as its largest value
-FAR = 1e9  # beyond every limit of a controller
-LINEAR = 1e-6  # by how much a controller may differ from its linear form, relative
-
-
-class Law(NamedTuple):
-    """The controller: u = F x^ + H h + u0 (m, .), linear while low <= u <= high."""
-
-    F: Array  # (m, n)
-    H: Array  # (m, p)
-    u0: Array  # (m,)
-    low: Array  # (m,)
-    high: Array  # (m,)
+PLANTS = (CarFollowing, LaneKeeping, SensorNetwork, ScalarLoop)  # whose vehicles or systems are linear while they move
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,61 +74,6 @@ class AffineLoop:
     uniform: bool = False  # the readings' noise is uniform: its generators hold all of it
 
 
-def probed(controller: Controller, model: Model) -> Law:
-    """Return the linear form of a controller, by probing it.
-
-    Raises
-    ------
-    NotApplicable
-        If it remembers something, or is not linear between its limits.
-    """
-    n, p, m = model.states, len(model.v2v), len(model.actuators)
-    plan = controller.prepare(model)
-    if (memory := controller.start(plan, 1)) is not None:
-        raise NotApplicable("--prove: controller", type(controller).__name__, "one without memory")
-    if (second := getattr(controller, "set_speed", None)) is not None:
-        raise NotApplicable("--prove: controller.set_speed", second, "none: the smaller of two laws is not linear")
-
-    def told(x: Array, heard: Array) -> Array:
-        rows = len(x)
-        flat = np.zeros((rows, 1))
-        estimate = Estimate(x[:, None], flat, flat > 0.0, flat.astype(np.int8), flat == 0.0)
-        return np.asarray(controller.step(plan, memory, estimate, heard[:, None], np.zeros((rows, 1, 0)))[1][:, 0])
-
-    size, eye = n + p, np.eye(n + p)
-    zero = np.zeros((1, size))
-    ends = told(np.concatenate([sign * FAR * eye for sign in (1.0, -1.0)])[:, :n], np.concatenate([FAR * eye, -FAR * eye])[:, n:])
-    low, high = ends.min(axis=0), ends.max(axis=0)
-    bounded = np.abs(ends).max() < 0.01 * FAR
-    low, high = (low, high) if bounded else (np.full(m, -np.inf), np.full(m, np.inf))
-    small = 1e-4 * (float(np.min(high - low)) if bounded else 1.0)
-    base = _inside(told, zero, n, low, high)
-    at = told(base[:, :n], base[:, n:])[0]
-    moved = told((base + small * eye)[:, :n], (base + small * eye)[:, n:]) - at
-    rows = moved.T / small
-    for scale in (-1.0, 3.0):
-        other = base + scale * small * eye
-        if np.abs(told(other[:, :n], other[:, n:]) - at - scale * moved).max() > LINEAR * max(float(np.abs(moved).max()), 1e-12):
-            raise NotApplicable("--prove: controller", type(controller).__name__, "one that is linear between its limits")
-    u0 = at - rows @ base[0]
-    return Law(rows[:, :n], rows[:, n:], u0, low, high)
-
-
-def _inside(told: Callable[[Array, Array], Array], zero: Array, n: int, low: Array, high: Array) -> Array:
-    """Return a point (1, n + p) at which the command lies well between its limits."""
-    rng = np.linspace(-1.0, 1.0, 41)
-    for size in (0.0, 1.0, 10.0, 100.0, 1000.0):
-        for i in range(zero.shape[1]):
-            tried = np.repeat(zero, len(rng), axis=0)
-            tried[:, i] = size * rng
-            u = told(tried[:, :n], tried[:, n:])
-            room = np.min(np.minimum(u - low, high - u), axis=1)
-            best = int(np.argmax(room))
-            if room[best] > 0.05 * float(np.min(high - low)) or np.isinf(room[best]):
-                return tried[best : best + 1]
-    raise NotApplicable("--prove: controller", "no point between its limits", "a controller that is linear somewhere")
-
-
 def gains(model: Model, prior: Array, steps: int, steady: bool) -> Array:
     """Return the gains (steps, n, q) of the Kalman filter of agent 0, from the covariance `prior` (n, n)."""
     C, R, P = model.C[0], model.R[0], steady_state(model)[0] if steady else model.A @ prior @ model.A.T + model.Q
@@ -169,6 +109,8 @@ def outside_of(place: Scenario, model: Model, delay: int, stale: bool, lead: tup
         For a plant whose loop is not linear.
     """
     plant, manoeuvre = place.plant, place.manoeuvre
+    if type(plant) not in PLANTS and model.v2v[:2] == LEADER:
+        raise NotApplicable("--prove: plant", type(plant).__name__, "one whose motion is known to be linear, such as car_following")
     if model.lane:
         if delay or lead is not None:
             given = ("--lead-accel", lead) if lead is not None else ("delay", delay)
@@ -229,8 +171,8 @@ def affine_loop(
     Parameters
     ----------
     at_rest
-        The loop has settled before step 1: SETTLE steps with the filter's constant gain, under noise alone. Else it begins as the
-        scenario does, with the gain that follows from the prior.
+        The loop has settled before step 1, with the filter's constant gain, under noise alone, behind a leader at constant speed. Else it
+        begins as the scenario does, with the gain that follows from the prior.
     spread
         Standard deviations that count as the largest value of Gaussian noise.
     delay
@@ -264,11 +206,14 @@ def affine_loop(
     out = outside_of(place, model, delay, stale, lead, bound)  # first: a controller of another plant may not be asked at all
     law = probed(place.controller, model) if model.actuators else None
     first = _start(place, model, spread)
-    burn = SETTLE if at_rest else 0
-    K = gains(model, first[2], burn + many, at_rest)
-    made = tuple(_step(model, law, out, K[k], granted[:q], place, spread, k < burn) for k in range(burn + many))
     start, box = _first(model, law, out, first, place, spread, at_rest)
     rows = tuple((np.concatenate([x, np.zeros(n), z]), offset) for x, z, offset in out.gaps)
+    burn = 0
+    if at_rest:
+        calm = _step(model, law, out, gains(model, first[2], 1, True)[0], granted[:q], place, spread, True)
+        burn = _settled(calm, start, [row for row, _ in rows], model.dt)
+    K = gains(model, first[2], burn + many, at_rest)
+    made = tuple(_step(model, law, out, K[k], granted[:q], place, spread, k < burn) for k in range(burn + many))
     k = np.arange(1 - burn, many + 1)
     last = many if threat.end is None else min(threat.end, many)
     budget = many if threat.budget is None else threat.budget
@@ -278,6 +223,18 @@ def affine_loop(
         1.0 / place.manoeuvre.radius[0] if model.lane else 0.0,
         spread, made[0].N.shape[1] - out.E.shape[1], box.shape[1] - out.E.shape[1], burn, *_lengths(place, model, spread),
     )  # fmt: skip
+
+
+def _settled(step: Step, start: Array, rows: list[Array], dt: float) -> int:
+    """Return after how many calm steps gap and command rest, SETTLE at least; raise NotApplicable where they do not."""
+    looked = np.concatenate([np.array(rows).reshape(-1, len(start)), step.command[0]])
+    least, now = max(SETTLE[0], ceil(SETTLE[1] / dt)), start
+    for count in range(1, 20 * least):
+        before, now = now, step.M @ now + step.m0
+        if (off := float(np.abs(looked @ (now - before)).max(initial=0.0))) <= STILL and count >= least:
+            return count
+    got = f"gap or command move by {off:.2g} a step after {count} steps"
+    raise NotApplicable("--at-rest", got, f"a loop that settles, to {STILL:g} a step")
 
 
 def _noise(place: Scenario, model: Model, spread: float) -> tuple[Array, Array]:
@@ -354,7 +311,7 @@ def _step(model: Model, law: Law | None, out: Outside, K: Array, granted: Array,
     N[:n, w] += process
     N[2 * n :, d] = 0.0 if calm else out.E
     W = np.concatenate([B @ lift @ bias, (A + B @ lift) @ bias, np.zeros((many, bias.shape[1]))])
-    m0 = np.concatenate([model.c + B @ shift, model.c + B @ shift, out.z0])
+    m0 = np.concatenate([model.c + B @ shift, model.c + B @ shift, np.zeros(many) if calm else out.z0])
     error = (estimate - x, np.zeros(n), noise, bias)
     command = (u, np.zeros(0), np.zeros((0, g)), np.zeros((0, bias.shape[1])))
     if law is not None:
@@ -382,4 +339,4 @@ def _first(
     wide = np.zeros((2 * n + len(out.start), generators.shape[1] + out.E.shape[1]))
     wide[:n, : generators.shape[1]] = generators
     wide[2 * n :, generators.shape[1] :] = 0.0 if at_rest else out.E
-    return np.concatenate([moved, moved, out.Z @ out.start + out.z0]), wide
+    return np.concatenate([moved, moved, out.Z @ out.start + (0.0 if at_rest else out.z0)]), wide

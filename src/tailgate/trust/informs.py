@@ -83,9 +83,9 @@ def difference(attacked: int, clean: int, n: int, alpha: float) -> dict[str, flo
 
 
 def informedness(rows: Sequence[Row], alpha: float) -> Row | None:
-    """Return the property of a defence: the attacked cell in which its alarm informs least; None where nobody asked for it.
+    """Return the property of a defence: the attacked cell of the least lower limit; None where nobody asked for it.
 
-    `earned` is the lower limit, and 0 for one below it.
+    `earned` is this limit, and 0 for one below it. The limits of all cells hold together.
     """
     held = [(row, found) for row in rows if isinstance(found := row.get(INFORMS), Mapping)]
     asked = [(row, found) for row, found in held if found["asked"]]
@@ -94,8 +94,8 @@ def informedness(rows: Sequence[Row], alpha: float) -> Row | None:
     entry: Row = {"name": INFORMS, "about": ABOUT, "share": None, "antecedent": None, "reason": "" if asked else "no attack began in time"}
     if not asked:
         return entry
-    row, found = min(asked, key=lambda item: (item[1]["attacked"] - item[1]["clean"]) / item[1]["asked"])
-    share = difference(found["attacked"], found["clean"], found["asked"], alpha / len(asked))
+    every = [(difference(found["attacked"], found["clean"], found["asked"], alpha / len(asked)), row, found) for row, found in asked]
+    share, row, found = min(every, key=lambda item: (item[0]["low"], item[0]["value"]))
     place = {key: row[key] for key in ("scenario", "dose", "attack")}
     counts = {"k": found["attacked"] - found["clean"], "n": found["asked"], "attacked": found["attacked"], "clean": found["clean"]}
     return entry | {"share": share | counts | place, "earned": max(share["low"], 0.0)}

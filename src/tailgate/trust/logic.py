@@ -22,16 +22,21 @@ from tailgate.base.errors import InputError
 from tailgate.core import Array
 
 SLACK = 1e-6  # of a step: 0.6 s is six steps of 0.1 s, whatever 0.6 / 0.1 rounds to
+TINY = float(np.finfo(float).tiny)  # the robustness of an atom at its border: above 0 where it holds there, below where it does not
 FAR = 1e9  # samples: beyond them lies no episode's end
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """B episodes: named signals (K, B), sampled every dt [s]; episode b has length[b] of the K samples, and at least one."""
+    """B episodes: named signals (K, B), sampled every dt [s]; episode b has length[b] of the K samples, and at least one.
+
+    horizon: samples of an episode that nothing ends; it counts where all that are there ended before.
+    """
 
     dt: float
     length: Array  # (B,)
     values: dict[str, Array]
+    horizon: int = 0
 
     @property
     def count(self) -> int:
@@ -233,7 +238,7 @@ class _Algebra(NamedTuple):
 
 
 _BOOLEAN = _Algebra(True, False, lambda x, strict: x > 0.0 if strict else x >= 0.0, np.logical_not)
-_ROBUST = _Algebra(np.inf, -np.inf, lambda x, strict: x, np.negative)
+_ROBUST = _Algebra(np.inf, -np.inf, lambda x, strict: np.where(x == 0.0, -TINY if strict else TINY, x), np.negative)
 
 
 def holds(formula: Formula, samples: Samples) -> Array:
@@ -242,7 +247,10 @@ def holds(formula: Formula, samples: Samples) -> Array:
 
 
 def robustness(formula: Formula, samples: Samples) -> Array:
-    """Return (B,) of each episode: above 0 where the formula holds, below where it does not [unit of the atom that decides]."""
+    """Return (B,) of each episode: above 0 where the formula holds, below where it does not [unit of the atom that decides].
+
+    It is never 0: where an atom is at its border, its truth decides by TINY.
+    """
     return np.asarray(robustness_along(formula, samples)[0])
 
 
@@ -259,14 +267,17 @@ def along(formula: Formula, samples: Samples) -> Array:
 
 
 def _check(formula: Formula, samples: Samples, start: int) -> None:
-    """Raise InputError for signals that are not there, and windows that begin after the last sample: what they say is no property."""
+    """Raise InputError for signals that are not there, and windows that begin after the last sample: what they say is no property.
+
+    The horizon counts, not the episodes: a window behind the end of an episode is empty, whatever others play along.
+    """
     if isinstance(formula, Atom) and (missing := formula.signals - set(samples.values)):
         raise InputError("formula", sorted(missing), f"signals that are there: {', '.join(sorted(samples.values))}")
-    window = getattr(formula, "within", None)
+    window, most = getattr(formula, "within", None), max(samples.count, samples.horizon)
     if window is not None:
         start += window.steps(samples.dt)[0]
-        if start >= samples.count:
-            raise InputError("formula", str(formula), f"windows that begin by the last sample, {(samples.count - 1) * samples.dt:g} s")
+        if start >= most:
+            raise InputError("formula", str(formula), f"windows that begin by the last sample, {(most - 1) * samples.dt:g} s")
     for part in formula.parts:
         _check(part, samples, start)
 

@@ -82,12 +82,19 @@ def closed_form(place: Scenario, speeds: Sequence[float] = SPEEDS) -> dict[str, 
     }  # fmt: skip
 
 
+def _not_covered(place: Scenario) -> list[str]:
+    """Return what the threat model grants, or the road does, that a proof says nothing about."""
+    kinds = [kind for kind in place.threat_model.kinds if kind != "fdi"]
+    return kinds + (["a car behind"] if getattr(place.plant, "rear", False) else [])
+
+
 def attack_size(place: Scenario, bound: float | None, alpha: float | None, **options: Unpack[LoopOptions]) -> dict[str, Any]:
     """Return the largest injected value that is proved safe, with the limits of the command and without them."""
     tube = Tube(affine_loop(place, bound=bound, **options), bound, alpha)
     most, calm = place.threat_model.fdi_bound, tube.under(0.0)
     return {
         "targets": [name for name, hit in zip(tube.loop.model.wires, injectable(place.brief()).tolist(), strict=True) if hit],
+        "not_covered": _not_covered(place),
         "budget": place.threat_model.budget, "steps": len(tube.loop.attacked) - tube.loop.burn,
         "noise": {"spread": tube.loop.spread} if alpha is None else {"alpha": alpha},
         "largest": tube.largest(most), "without_limits": tube.largest(most, limits=False), "most": most,

@@ -147,4 +147,4 @@ def sample(trace: Trace, names: Iterable[str], safe: SafeDistance) -> Samples:
         values[name] = np.max(counted, axis=2) if signal.most else np.min(counted, axis=2)
     if not len(trace.kind):
         raise InputError("trace", 0, "at least one step")
-    return Samples(trace.dt, trace.length, values)
+    return Samples(trace.dt, trace.length, values, trace.horizon)

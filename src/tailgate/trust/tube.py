@@ -16,12 +16,12 @@ from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array
 from tailgate.trust.affine import AffineLoop
 
-ROUND = 1e-9  # share by which an extent is widened, far above what rounding adds
+ROUND = 1e-9  # share of all that is summed by which an extent is widened, far above what rounding adds
 HALVINGS = 60
 
 
 class Extent(NamedTuple):
-    """The range of outputs at steps 1 .. K: (K, r) each, and for each the attack's summands by step, (K, r, K)."""
+    """The range of outputs at steps 1 .. K, or states 1 .. K + 1: (K, r) each, and the attack's summands by step, (K, r, K)."""
 
     centre: Array
     noise: Array  # all noise at its bound, in the worst order
@@ -46,11 +46,13 @@ class Verdict(NamedTuple):
 def extent(loop: AffineLoop, rows: Array, direct: tuple[Array, Array, Array] | None = None) -> Extent:
     """Return the range of rows (K, r, size) of the state, row k - 1 at step k, with what this step adds itself.
 
+    One row more than there are steps is that of the state behind the last step.
     direct: constants (K, r), noise (K, r, g) and injected values (K, r, a) that enter the output at its own step.
     """
-    many, r = rows.shape[:2]
-    carried, attack = np.array(rows), np.zeros((many, r, many))
-    centre, noise, variance, other = (np.zeros((many, r)) for _ in range(4))
+    burn, many = loop.burn, len(rows)
+    carried = np.array(rows[burn:])  # only these are seen
+    attack = np.zeros((*carried.shape[:2], len(loop.steps) - burn))
+    centre, noise, variance, other, size = (np.zeros(carried.shape[:2]) for _ in range(5))
 
     lengths = np.array(loop.lengths) if loop.lengths else np.full(loop.chance, loop.spread)
 
@@ -60,21 +62,25 @@ def extent(loop: AffineLoop, rows: Array, direct: tuple[Array, Array, Array] | N
         other[at] += np.abs(moved[..., chance:]).sum(axis=2)
 
     if direct is not None:
-        centre += direct[0]
-        add(slice(None), direct[1], loop.chance, lengths)
-        for k in np.flatnonzero(loop.attacked[:many]):
-            attack[k, :, k] = np.abs(direct[2][k]).sum(axis=1)
+        centre += direct[0][burn:]
+        size += np.abs(direct[0][burn:])
+        add(slice(None), direct[1][burn:], loop.chance, lengths)
+        for k in np.flatnonzero(loop.attacked):
+            attack[k - burn, :, k - burn] = np.abs(direct[2][k]).sum(axis=1)
     for j in range(many - 2, -1, -1):
-        step, later = loop.steps[j], carried[j + 1 :]
-        centre[j + 1 :] += later @ step.m0
-        add(slice(j + 1, None), later @ step.N, loop.chance, lengths)
+        step, behind = loop.steps[j], slice(max(j + 1 - burn, 0), None)
+        later = carried[behind]
+        centre[behind] += later @ step.m0
+        size[behind] += np.abs(later) @ np.abs(step.m0)
+        add(behind, later @ step.N, loop.chance, lengths)
         if loop.attacked[j]:
-            attack[j + 1 :, :, j] = np.abs(later @ step.W).sum(axis=2)
-        carried[j + 1 :] = later @ step.M
+            attack[behind, :, j - burn] = np.abs(later @ step.W).sum(axis=2)
+        carried[behind] = later @ step.M
     centre += carried @ loop.start
+    size += np.abs(carried) @ np.abs(loop.start)
     add(slice(None), carried @ loop.box, loop.begun, loop.spread)
-    wide, seen = 1.0 + ROUND, slice(loop.burn, None)
-    return Extent(centre[seen], noise[seen] * wide, variance[seen] * wide * wide, other[seen] * wide, attack[seen] * wide)
+    wide = 1.0 + ROUND
+    return Extent(centre, noise * wide, variance * wide * wide, other * wide + ROUND * size, attack * wide)
 
 
 def quantile_of(tail: float, uniform: bool) -> float:
@@ -126,7 +132,8 @@ class Tube:
         }  # fmt: skip
 
     def _constant(self, rows: list[Array], many: int) -> Extent | None:
-        return extent(self.loop, np.broadcast_to(np.array(rows), (many, len(rows), rows[0].size))) if rows else None
+        """Return the range of rows of the state, that behind the last step among them."""
+        return extent(self.loop, np.broadcast_to(np.array(rows), (many + 1, len(rows), rows[0].size))) if rows else None
 
     def _command(self) -> tuple[Extent, float]:
         """Return the range of the command less its share of a steady bend, and the largest size of that share.
@@ -148,7 +155,10 @@ class Tube:
         return extent(self.loop, parts[0], (parts[1], parts[2], parts[3]))
 
     def lower_gap(self, size: float) -> Array:
-        """Return the least gap (K,) [m] at each step under attacks of size a_max; of an error, its bound less the norm of its box."""
+        """Return the least gap (K + 1,) [m] at step 1 and behind each step under attacks of size a_max.
+
+        Where nobody drives: the bound of the error less the norm of its box, (K,).
+        """
         if self.gap is not None:
             low = self.gap_offset + self.gap.centre - self.wide["gap"] - size * self.pushed["gap"]
             return np.asarray(low.min(axis=1))
@@ -200,7 +210,7 @@ class Tube:
         return low
 
     def strongest(self) -> tuple[int, Array]:
-        """Return the step at which a unit attack takes most of the first gap, and the values (K, a) in [-1, 1] that do so.
+        """Return the number of the state, from 1, in which a unit attack takes most of the first gap, and its values (K, a) in [-1, 1].
 
         Raises
         ------
