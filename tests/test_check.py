@@ -169,6 +169,10 @@ def test_a_board_of_before_the_fingerprints_gets_them(board: Data, rows: list[Da
     assert with_check(checked, away)["entries"] == checked["entries"]  # some files were not there
     less = with_check(checked, check(board, sample=1))
     assert less["entries"] == checked["entries"]  # of two checks the one that looked into more stays
+    off = check(board, sample=1) | {"entries": [{"defence": e["defence"], "cells": 2, "equal": 0, "differs": 1, "unchecked": 1} for e in checked["entries"]]}
+    assert [entry["checked"]["differs"] for entry in with_check(checked, off)["entries"]] == [1, 1]  # a difference counts, however few cells
+    assert with_check(with_check(checked, off), check(board, sample=1))["entries"][0]["checked"]["differs"] == 1
+    assert with_check(with_check(checked, off), check(board))["entries"] == checked["entries"]  # until all cells came out equal
     for entry in checked["entries"]:
         entry["checked"] = {"cells": 9, "equal": 8, "differs": 0, "unchecked": 1}  # of the board when it had more cells
     assert {entry["checked"]["cells"] for entry in with_check(checked, check(board))["entries"]} == {2}

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from tailgate.agents.learners.cem import scales
-from tailgate.base.errors import InputError
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import draws
 from tailgate.core.draws import Keys
 from tailgate.core.kinds import EFFECTS, Kind
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_suite
 from tailgate.engine.agreement import Untraced
-from tailgate.ensemble import evolution, networks
+from tailgate.ensemble import evolution, members, networks, standard
 from tailgate.ensemble import search as searching
 from tailgate.ensemble.battery import Played, Scripts, battery_of, played_plainly, remembered
 from tailgate.ensemble.evolution import Evolution
@@ -291,3 +291,28 @@ def test_where_nobody_drives_an_error_is_damage(monkeypatch):
     assert 0.0 <= found[0].damage <= 1.0
     with pytest.raises(InputError, match="bound: got None; expected an error that counts as damage"):
         search(dataclasses.replace(place, bound=None), place.space, SMALL)
+
+
+def test_an_error_of_the_defence_ends_its_search(monkeypatch, tmp_path):
+    """It is no reason to leave a member out: a defence that breaks under a search would be attacked less, and ranked."""
+    place = arena("car")
+    monkeypatch.setattr(networks, "_drawn", lambda *_: (_ for _ in ()).throw(InputError("defence output x", "NaN or infinity", "finite numbers")))
+    monkeypatch.setattr(members, "members_of", lambda hunt: [one for one in members.MEMBERS if one.name == "networks"])
+    hunt = members.Hunt(place, standard.BUDGETS["quick"], 0, tmp_path)
+    with pytest.raises(InputError, match="defence output x"):
+        members.harvest(hunt)
+    monkeypatch.setattr(Arena, "confirmed", lambda *_: (_ for _ in ()).throw(NotApplicable("defence", "mine", "no search")))
+    with pytest.raises(NotApplicable, match="no search"):
+        place.promising(["fdi"])
+    monkeypatch.undo()
+    nothing = arena("car", threat={"kinds": ()})
+    with pytest.raises(searching.Meaningless):
+        starts_of(nothing, "black", [], 0)
+
+
+def test_computed_optima_are_no_members(monkeypatch):
+    """They count for no rank, and would take the place of the best white box that does."""
+    place, asked = arena("car"), []
+    monkeypatch.setattr(Arena, "promising", lambda self, texts: asked.extend(texts) or [])
+    members._white_box(members.Hunt(place, standard.BUDGETS["quick"], 0, None))
+    assert asked and not any(Spec("attack", text).entry.optimal for text in asked)

@@ -124,6 +124,8 @@ def test_a_strangers_class_is_ranked_only_from_a_sandbox_and_on_seeds_of_a_beaco
     assert entry(board(rows), "a")["status"] == "ranked"
     free = board([row | {"submission": {"sandbox": ""}} if row["defence"] == "a" else row for row in rows])
     assert entry(free, "a")["why"].startswith("claimed: not played by") and entry(free, "a")["rank"] is None
+    part = board([row | ({"defence": "composed:detector=mine:Mine", "submission": None} if row["defence"] == "a" else {}) for row in rows])
+    assert entry(part, "composed:detector=mine:Mine")["why"].startswith("claimed: not played by")  # somebody's part in a built-in shell
     public = board([row | {"beacon": ""} for row in rows])
     assert entry(public, "a")["why"] == "claimed: played on public seeds"
 

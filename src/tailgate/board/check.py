@@ -245,17 +245,25 @@ def _played(found: Data) -> int:
     return int(found["equal"] + found["differs"])
 
 
+def _outweighs(old: Data, new: Data) -> bool:
+    """Return if an earlier check stays: it played more, or found a difference where this one, of a part of the cells, found none."""
+    if bool(old["differs"]) != bool(new["differs"]):
+        return bool(old["differs"]) and _played(new) < new["cells"]
+    return _played(old) > _played(new)
+
+
 def with_check(data: Data, report: Data) -> Data:
     """Return the board with a check: `checked` in the entries that were looked into, fingerprints in cells that came out equal.
 
-    An entry keeps the check that played more cells; one of another number of cells is of another board. Comparisons that were bounds are
+    An entry keeps the check that played more cells, or found a difference that no whole check has refuted. One of another number of cells
+    is of another board. Comparisons that were bounds are
     made again of cells that now say which episodes came to damage, and ranks with them.
     """
     before = {entry["defence"]: entry.get("checked") for entry in data["entries"]}
     checked: dict[str, Data] = {}
     for entry in report["entries"]:
         new, old = {key: entry[key] for key in ("cells", *VERDICTS)}, before.get(entry["defence"])
-        if not (old and old["cells"] == new["cells"] and _played(old) > _played(new)):
+        if not (old and old["cells"] == new["cells"] and _outweighs(old, new)):
             checked[entry["defence"]] = {"checked": new}
     cells = [cell | report["prints"].get(str(i), {}) for i, cell in enumerate(data["cells"])]
     return sharpened(amended(data, checked, cells=cells), suite_of(read_board(data)))

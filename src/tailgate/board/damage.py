@@ -279,7 +279,7 @@ def _same_cell(key: Key, one: Row, other: Row) -> None:
 
 def _same_result(key: Key, one: Row, other: Row) -> None:
     """Raise InputError where an episode came out in two ways: else the file that is read last would decide."""
-    for field in ("trace_hash", "status", *METRICS):
+    for field in ("trace_hash", "status", "uses", "learned", "trained", "optimal", "submission", *METRICS):
         if one.get(field) != other.get(field):
             raise InputError(f"rows of {named(key)}, seed {one['seed']}: {field}", [one.get(field), other.get(field)], "rows of one result")
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from tailgate.core.registry import Entry, built_in
+from tailgate.core.registry import PARTS, Entry, Family, built_in
 from tailgate.core.scenario import Suite
-from tailgate.core.spec_text import split_text
+from tailgate.core.spec_text import split_items, split_text
 from tailgate.evaluation.paired import class_of
 from tailgate.evaluation.rounds import numbered
 from tailgate.evaluation.rows import CLEAN, Row
@@ -21,7 +22,7 @@ from .gates import failure, gates
 from .measures import extended as later
 from .measures import mean_gap, pointwise, under_attack
 from .schema import Data
-from .searched import unsearched
+from .searched import found_for, unsearched
 from .worst import Worst
 
 CLEAN_METRICS = (
@@ -37,6 +38,8 @@ def middle(suite: Suite) -> int:
     """Return the index of the middle one of the doses that are shown; of all where none is named."""
     chosen = shown(suite)
     return chosen[len(chosen) // 2]
+
+NAMED_CLASS = re.compile(r"[\w.]:[A-Za-z_]\w*(?![\w.]*=)")  # module:Class, also of a part: composed:detector=module:Class
 
 
 def shown(suite: Suite) -> list[int]:
@@ -70,10 +73,12 @@ def entry_of(
     if not why and defence in provisional:
         why = f"{PROVISIONAL}: tried outside a round"
     whole = {k: worst for k, worst in levels.items() if worst.complete}
+    found_by_search = found_for(searches)
+    own = {attack: origin for attack, origin in origins.items() if attack not in found_by_search}  # searches are no trainings of one plan
     return {
         "defence": defence, "card": None if card is None else card.card(), "uses": uses, "class": class_of(uses),
         "status": status, "why": why, "gates": found, "rank": None, "clean": _clean(table, defence),
-        "flags": flags(table, defence, levels, dose, origins, trained), "worst_episode": _episode(table, whole, dose), "stealth": None,
+        "flags": flags(table, defence, levels, dose, own, trained), "worst_episode": _episode(table, whole, dose), "stealth": None,
     } | of_worst(table, levels, dose) | (_measures(table, defence, whole) if table.suite.measures else {})  # fmt: skip
 
 
@@ -127,13 +132,16 @@ def curves(levels: dict[str, Worst]) -> list[Data]:
 
 
 def _card(defence: str) -> Entry | None:
-    """Return the card of a built-in defence; a plug-in has none, as a board must not import the class that a row names."""
-    return _built_in().get(split_text(defence)[0])
+    """Return the card of a built-in defence. What runs somebody else's code has none, as a board must not import what a row names."""
+    head, params = split_text(defence)
+    given = dict(item.partition("=")[::2] for item in split_items(params))
+    strangers = any(given[part].strip() not in _built_in(part) for part in PARTS if part in given)
+    return None if strangers or NAMED_CLASS.search(defence) else _built_in("defence").get(head)
 
 
 @functools.cache
-def _built_in() -> dict[str, Entry]:
-    return built_in("defence")
+def _built_in(family: Family) -> dict[str, Entry]:
+    return built_in(family)
 
 
 def reference(defence: str, uses: Collection[str], card: Entry | None) -> str:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from .files import read_board
+from .measures import SOME
 from .order import ordered
 from .words import at_least
 
@@ -86,7 +87,10 @@ def _under_attack(entry: Board, dose: str) -> list[str]:
     if line is None:
         return ["-", "-"]
     hard, kept, least = line["severity"], line["availability"], line["least"]
-    impact = "-" if hard["mean"] is None else f"{hard['mean']:.3g} (90 %: {hard['q90']:.3g})"
+    impact = f"- ({hard['collisions']} from behind)" if hard["collisions"] else "-"
+    if hard["mean"] is not None:
+        few = hard["measured"] < SOME
+        impact = f"{hard['mean']:.3g} ({'greatest' if few else '90 %'}: {hard['most' if few else 'q90']:.3g})"
     return [impact, "-" if kept is None else f"{100 * kept:.0f} %" + (f" (least {100 * least['value']:.0f})" if least else "")]
 
 

@@ -26,11 +26,13 @@ from .worst import Worst
 ABOUT = {  # how to read each
     "pointwise": "Share of episodes that none of the attacks damaged: a bound with hindsight, as an attacker would have to know beforehand "
     "which attack works in which episode",
-    "severity": "Mean closing speed of the collisions under the worst attack, and the speed that nine of ten of them stay below",
+    "severity": "Mean closing speed of the collisions under the worst attack, and the speed that nine of ten of them stay below; the "
+    "greatest of fewer than ten. Of attacks that do as much damage the first one listed counts",
     "availability": "Distance under the worst attack over that without an attack, mean over episodes; least: under the attack that costs "
     "most distance",
     "mean_gap": "Mean gap without an attack over that of the undefended car, less one: a longer gap makes every attack harder",
 }  # fmt: skip
+SOME = 10  # collisions from which on nine of ten means something
 SPEEDS = {"median": 0.5, "q90": 0.9, "most": 1.0}  # quantiles of impact speeds
 VAGUE = "the board does not say which episodes came to damage"
 NO_IMPACT = "no collision"

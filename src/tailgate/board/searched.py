@@ -201,6 +201,8 @@ def _lacking(cell: Data, whole: bool) -> str:
             return f"neither damage nor a reason of {name}"
         if whole and one["why"] == standard.ELSEWHERE:
             return f"{name} did not search"
+    if all(one["damage"] is None for one in members.values()):
+        return "no member found an attack"
     for level in KNOWLEDGE:
         mine = [one for one in members.values() if one["knowledge"] == level and one["damage"] is not None]
         if mine and not any(one["attack"] is not None for one in mine):

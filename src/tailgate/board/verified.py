@@ -58,16 +58,16 @@ def read_report(path: Path) -> Report:
 def with_verified(board: Data, folder: Path, files: Mapping[str, Mapping[str, int]]) -> Data:
     """Return the board with `verified` in each entry: {"rows", "verified", "differs", "unchecked"}, or null where nobody has looked.
 
-    files: SHA-256 of each file of rows that the board is made of, and how many rows of each defence it has. A report on any other file, or
-    on one that has changed since, does not count. If two reports are on one file, the one counts that asked for more rows. A defence has
-    figures only if rows of all its files were played again.
+    files: SHA-256 of each file of rows that the board is made of, and how many rows of each defence it has. A report on any other file,
+    or on one that has changed since, does not count. If two reports are on one file, the one counts that found a difference, then the one
+    that asked for more rows. A defence has figures only if rows of all its files were played again.
     """
     looked: dict[tuple[str, str], Again] = {}
     for path in sorted(folder.glob("*.json")):
         for file in read_report(path).files:
             for again in file.entries:
                 key = file.file, again.defence
-                if key not in looked or again.asked > looked[key].asked:
+                if key not in looked or (bool(again.differs), again.asked) > (bool(looked[key].differs), looked[key].asked):
                     looked[key] = again
 
     changes: dict[str, Data] = {}

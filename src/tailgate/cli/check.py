@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tailgate.base.errors import InputError
+from tailgate.base.locks import alone
 from tailgate.cli.shared import Commands, add_options, counted, drawn_by, sample_seed, say, say_most, show, table, working
 
 LONGEST = 160  # characters of a figure that are shown
@@ -52,7 +53,8 @@ def _check(options: argparse.Namespace) -> int:
         else:
             report = check(board, **asked, progress=counted(update, "playing"))
     if options.write:
-        save(with_check(board, report), path)
+        with alone(path.parent):  # others may have written meanwhile
+            save(with_check(load(path), report), path)
     show(options, report, _print_detection if options.detection else _print)
     return 1 if report["counts"]["differs"] or report.get("strays") or not report["counts"]["equal"] else 0
 

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tailgate.base.errors import InputError, NotApplicable
+from tailgate.base.errors import InputError
 from tailgate.core import Array, Kind, draws
 from tailgate.core.draws import Keys
 from tailgate.core.schema import as_data, digest
 from tailgate.ensemble.schedule import Schedule, Scheduled, schedule_of
-from tailgate.ensemble.search import FINAL, FIRST, MORE, Arena, Found
+from tailgate.ensemble.search import FINAL, FIRST, MORE, Arena, Found, Meaningless
 from tailgate.ensemble.space import GENES
 from tailgate.play.metrics import METRICS
 from tailgate.play.trace import rollout
@@ -204,7 +204,7 @@ def gradient(arena: Arena, pace: Pace, out: Path, seed: int = 0, tell: Tell | No
     ------
     ImportError
         If PyTorch is not installed (extra `train`).
-    NotApplicable
+    Meaningless
         For a system of several agents without derivatives by machine code.
     """
     from tailgate.ensemble.injection import Injection
@@ -216,7 +216,7 @@ def gradient(arena: Arena, pace: Pace, out: Path, seed: int = 0, tell: Tell | No
     for number, start in enumerate(starts(arena, pace, seed, scripts)):
         injection = Injection(arena.loop, start.when())
         if (agents := arena.loop.model.agents) > 1 and not injection.compiled:
-            raise NotApplicable("agents", agents, "1: PyTorch takes half a minute for a gradient through this loop")
+            raise Meaningless("agents", agents, "1: PyTorch takes half a minute for a gradient through this loop")
         name = f"{arena.name}-{'own' if arena.dose is None else arena.dose}-gradient-{digest([as_data(arena), seed, number])}.yaml"
         path = out / name
 

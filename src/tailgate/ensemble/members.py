@@ -17,7 +17,7 @@ from tailgate.core.schema import fields_of
 from tailgate.engine.untraceable import Untraceable
 from tailgate.ensemble.gradient import Pace, gradient
 from tailgate.ensemble.networks import FORMS, PUBLISHED, Phase, Race, is_ramp, learned, transferred
-from tailgate.ensemble.search import FINALISTS, Arena, Effort, Found, Tell, search
+from tailgate.ensemble.search import FINALISTS, Arena, Effort, Found, Meaningless, Tell, search
 
 ALIKE = 2  # finalists of a family: others may come from behind
 IMITATED = 2  # scripts that networks imitate at the start
@@ -109,7 +109,7 @@ def _transfer(hunt: Hunt) -> list[str]:
     """Play the published policies that have a meaning here."""
     found = transferred(hunt.arena)
     if not found:
-        raise NotApplicable("zoo", f"{len(zoo_names())} policies", "one with the observations and the actions of this threat model")
+        raise Meaningless("zoo", f"{len(zoo_names())} policies", "one with the observations and the actions of this threat model")
     return hunt.arena.promising(f"zoo:name={policy.name}" for policy, _ in found)
 
 
@@ -118,7 +118,7 @@ def _white_box(hunt: Hunt) -> list[str]:
     out, (low, high) = [], hunt.arena.space.road.get("near", (0.0, 0.0))
     opened = [f"trigger=near,threshold={low + share * (high - low):.4g}" for share in OPENED] if high > low else []
     for name, entry in entries("attack").items():
-        if entry.knowledge != "white":
+        if entry.knowledge != "white" or entry.optimal:  # a computed optimum is a ceiling, and counts for no rank
             continue
         for text in (name, *(f"{name}:{words}" for words in opened if "trigger" in fields_of(entry.cls))):
             try:
@@ -191,7 +191,7 @@ def harvest(hunt: Hunt, before: Sequence[Harvest] = (), after: Callable[[list[Ha
         try:
             found = hunt.arena.best(member.find(hunt))
             why = "" if found else "the threat model grants nothing for it"
-        except (NotApplicable, ImportError, Untraceable) as error:  # not traced: no derivative
+        except (Meaningless, ImportError, Untraceable) as error:  # not traced: no derivative. An error of the defence ends the search
             why = str(error)
         hunt.found[member.name] = found
         out.append(Harvest(member.name, member.knowledge, found, why))

@@ -28,7 +28,7 @@ from tailgate.core.neural import Network
 from tailgate.core.registry import Spec
 from tailgate.engine.parameters import LARGE
 from tailgate.ensemble.evolution import JUDGED, SHORTER, ZOO, Evolution, Start
-from tailgate.ensemble.search import Arena, Tell
+from tailgate.ensemble.search import Arena, Meaningless, Tell
 from tailgate.envs.gym.actions import ActionCodec, ActionSpec
 from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.envs.gym.observations import ObservationCodec
@@ -148,7 +148,7 @@ def _drawn(
     """Return, in each form, a policy with these actions that rests, and one that imitates each script. only: names that are made."""
     codec, deep = ActionCodec(action, loop.brief), ObservationCodec(loop.brief, SEEN)
     if codec.size < 2:
-        raise NotApplicable("threat_model.kinds", loop.threat.kinds, "a kind of attack to choose")
+        raise Meaningless("threat_model.kinds", loop.threat.kinds, "a kind of attack to choose")
     seat, episodes = Seat(loop, codec, deep, Reward(), {}), max(SHOWN // loop.model.agents, FEWEST)
 
     @functools.cache
@@ -187,17 +187,20 @@ def starts_of(arena: Arena, knowledge: str, scripts: Sequence[str], seed: int, o
 
     Policies that move a value step by step begin from the first script of one size, and from the first ramp.
     only: names of those that are made, next to the published ones; empty: all.
-    Raises NotApplicable where the threat model grants nothing that a policy could choose.
+    Raises Meaningless where the threat model grants nothing that a policy could choose.
     """
     loop, out = arena.seat(knowledge), []
     try:
-        out += _drawn(loop, action_of(arena, scripts), FORMS, scripts, seed, only)
-        moved = [(script, action) for script in scripts if (action := ramp_of(arena, script)) is not None]
-        for ramp in (False, True):
-            for script, action in [one for one in moved if is_ramp(one[0]) == ramp][:1]:
-                out += _drawn(loop, action, [RAMPING], [script], seed, only)
+        action = action_of(arena, scripts)
+        moved = [(script, ramp) for script in scripts if (ramp := ramp_of(arena, script)) is not None]
+        for one in (action, *(ramp for _, ramp in moved)):
+            ActionCodec(one, loop.brief)
     except InputError as error:
-        raise NotApplicable(error.field, error.value, error.expected) from None
+        raise Meaningless(error.field, error.value, error.expected) from None
+    out += _drawn(loop, action, FORMS, scripts, seed, only)
+    for growing in (False, True):
+        for script, raised in [one for one in moved if is_ramp(one[0]) == growing][:1]:
+            out += _drawn(loop, raised, [RAMPING], [script], seed, only)
     fit = [
         Start(ZOO + policy.name, held, np.ones(len(held.observation.names))) for policy, held in transferred(arena)
         if policy.knowledge == knowledge and held.network.lstm is None and held.action.discrete

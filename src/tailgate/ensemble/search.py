@@ -6,7 +6,6 @@ time, so that luck is not believed. The same seed finds the same scripts, whatev
 
 from __future__ import annotations
 
-import contextlib
 import time
 import zlib
 from collections.abc import Callable, Iterable
@@ -240,8 +239,13 @@ class Arena:
         """Return the attacks that did most harm on some select episodes; those without a meaning here are left out."""
         tried = {}
         for text in dict.fromkeys(texts):
-            with contextlib.suppress(NotApplicable):
-                tried[text] = self.confirmed(text, "select", 0, min(TRIED, FINAL))[1]
+            spec = Spec("attack", text)
+            try:
+                attack = spec.make()
+                attack.prepare(self.seat(spec.entry.knowledge, attack).brief)
+            except NotApplicable:
+                continue
+            tried[text] = self.confirmed(text, "select", 0, min(TRIED, FINAL))[1]  # an error of the defence is none of the attack
         return sorted(tried, key=lambda one: -tried[one])[:count]
 
     def best(self, texts: Iterable[str]) -> list[Found]:
@@ -273,6 +277,10 @@ def _stepwise(loop: Loop, attack: Attack, keys: Keys) -> Played:
     trace = rollout(loop, attack, keys)
     gap = METRICS["min_gap"](trace) if loop.model.followers.any() else np.full(len(keys.key), np.inf)
     return Played(METRICS["crashed"](trace) > 0, gap, *(METRICS[name](trace) for name in ("max_error", "distance_travelled")))
+
+
+class Meaningless(NotApplicable):
+    """A member of the ensemble has nothing to do under a threat model, whatever the defence does."""
 
 
 class Pool(NamedTuple):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tailgate.board.attachments import EqualGap
-from tailgate.board.measures import ABOUT
+from tailgate.board.measures import ABOUT, SOME
 from tailgate.board.schema import LEVELS, Data, Entry, Level, MeanGap, Pointwise, UnderAttack
 from tailgate.board.words import at_least, percent
 
@@ -84,7 +84,8 @@ def _severity(line: UnderAttack | None) -> Data:
         return NONE | {"about": line.severity.reason if line else ""}
     held = line.severity
     about = f"{held.collisions} collisions, {held.stops} stops without one"
-    return {"text": figure(held.mean, 3), "low": f"90%: {figure(held.q90, 3)}", "sort": f"{held.mean:.6g}", "about": about}
+    low = f"90%: {figure(held.q90, 3)}" if held.measured >= SOME else f"greatest: {figure(held.most, 3)}"
+    return {"text": figure(held.mean, 3), "low": low, "sort": f"{held.mean:.6g}", "about": about}
 
 
 def _availability(suite: Suite, line: UnderAttack | None) -> Data:
