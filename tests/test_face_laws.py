@@ -350,3 +350,20 @@ def test_a_copy_is_drawn_as_its_original():
         other.render()
     other.batch.reset()
     assert other.batch.render()[0].shape == env.render().shape
+
+
+def test_the_batch_of_stable_baselines_keeps_its_contract():
+    """Results of one row each are told apart from those that all share; unknown options are refused; pictures can be had."""
+    pytest.importorskip("stable_baselines3")
+    from tailgate.envs.gym.sb3 import BatchVecEnv
+
+    env = BatchVecEnv(3, render_mode="rgb_array")
+    env.seed(4)
+    env.reset()
+    assert env.env_method("card") == [env.batch.card()] * 3 and len(env.env_method("action_masks", indices=[0, 2])) == 2
+    assert [type(one) for one in env.get_attr("over")] == [np.bool_] * 3
+    assert len(env.get_images()) == 3 and env.get_images()[0].dtype == np.uint8
+    env.set_options({"nothing": 1})
+    with pytest.raises(InputError, match="nothing"):
+        env.reset()
+    env.reset()

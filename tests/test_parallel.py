@@ -372,3 +372,10 @@ def test_the_examples_of_the_documentation_run(capsys):
         exec(block, {})
     paid = ast.literal_eval(capsys.readouterr().out)
     assert set(paid) == {"attacker", "defender"} and paid["attacker"] != 0.0 and paid["defender"] < 0.0
+
+
+def test_the_attacker_is_told_what_every_environment_tells():
+    env = tailgate.parallel_env()
+    _, infos = env.reset(seed=0)
+    names = gymnasium.make("tailgate:tailgate/CarFollowing-v0").reset(seed=0)[1].keys()
+    assert infos["attacker"].keys() == names

@@ -28,6 +28,7 @@ import numpy as np
 from pydantic import Field
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
+from threadpoolctl import threadpool_limits
 
 from tailgate.agents.learners.learning import CONTINUOUS, DISCRETE, SEED_STRIDE, Progress, header_of, open_checkpoint
 from tailgate.agents.learners.teacher import Demonstration
@@ -298,11 +299,12 @@ def imitation(shape: Shape, shown: Demonstration, rng: np.random.Generator, batc
         weight /= np.sqrt(len(weight))
         bias[:] = 0.0
     first, second = np.zeros_like(theta), np.zeros_like(theta)
-    for t in range(1, IMITATION_ROUNDS + 1):
-        some = rng.integers(0, len(shown.action), batch)
-        slope = _slope(shape, theta, shown.observation[some] / size, shown.action[some])
-        first, second = 0.9 * first + 0.1 * slope, 0.999 * second + 0.001 * slope**2
-        theta -= IMITATION_RATE * (first / (1.0 - 0.9**t)) / (np.sqrt(second / (1.0 - 0.999**t)) + 1e-8)
+    with threadpool_limits(1, "blas"):  # the order of a sum would follow the number of threads
+        for t in range(1, IMITATION_ROUNDS + 1):
+            some = rng.integers(0, len(shown.action), batch)
+            slope = _slope(shape, theta, shown.observation[some] / size, shown.action[some])
+            first, second = 0.9 * first + 0.1 * slope, 0.999 * second + 0.001 * slope**2
+            theta -= IMITATION_RATE * (first / (1.0 - 0.9**t)) / (np.sqrt(second / (1.0 - 0.999**t)) + 1e-8)
     shape.layers(theta)[0][0][:] /= size[:, None]
     weight, bias = shape.layers(theta)[-1]
     scale = np.sqrt(np.mean(np.concatenate([weight.ravel(), bias]) ** 2))

@@ -41,8 +41,8 @@ class ActionSpec:
     shares: tuple[Positive, ...] = param((), "mode: parts of the bias and of `delay` in (0, 1], an action each; none: all", if_any=True)
     steps: PositiveCount = param(10, "age of a delay, window of a replay [steps]")
     rate: Positive = param(0.5, "ramp, increment: (largest) change per step [unit of the wire]")
-    per_sensor: bool = param(False, "mode, ramp: also one mode per single wire")
-    per_agent: bool = param(False, "mode, ramp: also one mode per single agent")
+    per_sensor: bool = param(False, "timing, mode, ramp: also one mode per single wire")
+    per_agent: bool = param(False, "timing, mode, ramp: also one mode per single agent")
     interval: PositiveCount = param(1, "steps for which a decision holds: one step of the environment")
 
 

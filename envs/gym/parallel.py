@@ -133,7 +133,14 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
     def _infos(self, illegal: np.bool_, collided: np.bool_, rear: np.bool_) -> dict[str, dict[str, Any]]:
         """Return the information by agent: the attacker learns what happened, the defender has only its own means."""
         assert self.game is not None
-        attacker: dict[str, Any] = {"illegal": illegal, "collided": collided, "rear_collided": rear, "step": self.game.loop.k[0]}
+        view = self.duel.seat.loop.sense(self.game.loop)
+        attacker: dict[str, Any] = {
+            "illegal": illegal, "collided": collided, "rear_collided": rear, "allowed": view.allowed[0], "step": self.game.loop.k[0],
+        }  # fmt: skip
+        if self.duel.seat.road:
+            attacker["gap"] = np.min(view.scene.gap[0])
+        else:
+            attacker["error"] = self.game.tally.error[0]
         defender = self.duel.told(self.game)
         if self.duel.seat.action.discrete:
             attacker["action_mask"] = self.duel.mask(self.game)[0].astype(np.int8)

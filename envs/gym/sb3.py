@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -33,7 +32,9 @@ class BatchVecEnv(VecEnv):
         self._returns, self._lengths = np.zeros(num_envs), np.zeros(num_envs, np.int64)
 
     def reset(self) -> Array:
-        observation, _ = self.batch.reset(seed=self._seeds[0])  # row i: this seed + i, as `seed` sets them
+        options = self._options[0] or None
+        self._reset_options()
+        observation, _ = self.batch.reset(seed=self._seeds[0], options=options)  # row i: this seed + i, as `seed` sets them
         self._reset_seeds()
         self._returns[:], self._lengths[:] = 0.0, 0
         return observation
@@ -64,15 +65,22 @@ class BatchVecEnv(VecEnv):
         return self.batch.action_masks()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        return [getattr(self.batch if hasattr(self.batch, attr_name) else self, attr_name)] * len(list(self._get_indices(indices)))
+        return self._by_row(getattr(self.batch if hasattr(self.batch, attr_name) else self, attr_name), indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         raise AttributeError(f"{attr_name}: the rows of a batch have no separate attributes")
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        rows: Sequence[int] = list(self._get_indices(indices))
-        result = getattr(self.batch, method_name)(*args, **kwargs)
-        return [result[i] for i in rows]
+        return self._by_row(getattr(self.batch, method_name)(*args, **kwargs), indices)
+
+    def _by_row(self, value: Any, indices: VecEnvIndices) -> list[Any]:
+        """Return the parts of an array of all rows, or what they share."""
+        of_rows = isinstance(value, np.ndarray | tuple | list) and len(value) == self.num_envs
+        return [value[i] if of_rows else value for i in self._get_indices(indices)]
+
+    def get_images(self) -> list[Array]:
+        """Return the picture of each row; needs `render_mode="rgb_array"`."""
+        return list(self.batch.render() or ())
 
     def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
         return [False] * len(list(self._get_indices(indices)))

@@ -216,7 +216,7 @@ class Game:
             crash = "" if now.crash is None else f"collisions {100 * now.crash:4.1f} %"
             self.update(name, min(now.steps, steps), steps, crash)
 
-        learner.learn(steps, report, checkpoint)
+        learner.learn(steps, report, checkpoint, max(steps // 10, 1))
         done: Path = learner.export(path, facts | {"steps": learner.steps, "curve": learner.curve})
         learner.close()
         for old in self.directory.glob(f"checkpoint-{name}-*.safetensors"):
