@@ -123,13 +123,13 @@ def test_a_cell_that_is_there_twice_is_refused(published: Data) -> None:
 
 
 @pytest.mark.thin(2)
-@pytest.mark.parametrize(("field", "value"), [("rank", {"best": 1, "worst": 1}), ("why", ""), ("flags", ["a flag"]), ("gates", 99.0)])
+@pytest.mark.parametrize(("field", "value"), [("status", "unattacked"), ("why", ""), ("flags", ["a flag"]), ("gates", 99.0)])
 def test_ranks_gates_and_flags_are_made_again_where_all_cells_are_played(board: Data, field: str, value: Any) -> None:
     entry = board["entries"][1]
     entry[field] = [gate | {"limit": value} for gate in entry["gates"]] if field == "gates" else value
     assert [(line["defence"], line["field"]) for line in check(board)["strays"]] == [("kf", field)]
     less = check(board, sample=3)
-    assert bool(less["strays"]) == (field == "rank") and not less["scored"]  # who takes no rank has none, whatever was played
+    assert bool(less["strays"]) == (field == "status") and not less["scored"]  # which cells are there decides on the status
 
 
 def test_some_cells_are_drawn_or_named(board: Data) -> None:
@@ -144,7 +144,7 @@ def test_some_cells_are_drawn_or_named(board: Data) -> None:
         check(board, sample=0)
 
 
-@pytest.mark.parametrize(("field", "value"), [("n", 5), ("failed", 1), ("decisions", "0" * 16), ("trace", "0" * 16), ("damage", {"value": 0.5, "low": 0.1, "high": 0.9})])
+@pytest.mark.parametrize(("field", "value"), [("n", 5), ("failed", 1), ("decisions", "0" * 16), ("trace", "0" * 16)])
 def test_a_changed_figure_differs_and_is_named(board: Data, field: str, value: Any) -> None:
     board["cells"][3][field] = value
     report = check(board)

@@ -1,18 +1,23 @@
 """Rows in a notebook."""
 
+import copy
 import csv
 import io
 import json
 import sys
+from pathlib import Path
 
 import pytest
 
 import tailgate
+from tailgate.base.errors import InputError
 from tailgate.board.export import COLUMNS, exported
-from tailgate.board.files import load
+from tailgate.board.files import load, read_board
 from tailgate.board.frame import BoardData
 from tailgate.board.head import lines
 from tailgate.evaluation.frame import SHOWN, Rows
+
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -84,3 +89,21 @@ def test_a_board_without_pandas_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match=r"pip install 'tailgate\[pandas\]'"):
         load("quick-v1").to_pandas()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda b: b["cells"].append(b["cells"][0]), "a cell that is there once"), (lambda b: b["cells"][0]["damage"].update(value=7.5), "from 0 to 1"),
+        (lambda b: b["cells"][0]["damage"].update(low=0.9, value=0.5, high=0.4), "from 0 to 1"), (lambda b: b["entries"][0].update(rank=None), "exactly if ranked"),
+        (lambda b: next(e for e in b["entries"] if e["rank"])["rank"].update(best=9, worst=1), "the best place first"),
+        (lambda b: next(e for e in b["entries"] if e["rank"])["gates"][0].update(passed=False), "gates that a ranked entry passes"),
+        (lambda b: next(c for c in b["cells"] if c.get("hits") and c["damage"]["value"] > 0.0).update(hits="0" * 26), "as its hits say"),
+    ],
+)  # fmt: skip
+def test_a_board_that_contradicts_itself_is_refused(change, words):
+    board = copy.deepcopy(load(ROOT / "results" / "quick-v1" / "board.json.xz"))
+    board["entries"].sort(key=lambda entry: entry["rank"] is None)
+    change(board)
+    with pytest.raises(InputError, match=words):
+        read_board(board)

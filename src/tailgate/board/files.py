@@ -20,8 +20,9 @@ from tailgate.core.scenario import Suite, list_suites, load_suite
 from tailgate.evaluation.stats import mean_time
 
 from .frame import BoardData
-from .schema import FORMAT, AtThreshold, Board, Data, Detection, EntryTrust, Part
+from .schema import FORMAT, AtThreshold, Board, Data, Detection, Entry, EntryTrust, Part
 
+CLOSE = 1e-9  # to which shares agree
 BOARD = "board.json"
 
 
@@ -129,11 +130,22 @@ class _Agreement:
             if entry.defence in met:
                 raise InputError(f"{where}.entries[{i}].defence", entry.defence, "a defence that is named once")
             met.add(entry.defence)
+            self._rank(entry, f"{where}.entries[{i}]")
+        played = set[tuple[object, ...]]()
         for i, cell in enumerate(board.cells):
             self._refer(f"{where}.cells[{i}]", cell, "defence", "scenario", "dose")
+            place = cell.defence, cell.scenario, cell.dose, cell.attack, cell.knowledge
+            if place in played:
+                raise InputError(f"{where}.cells[{i}]", list(place), "a cell that is there once")
+            played.add(place)
             if cell.hits is not None and (len(cell.hits) != 2 * -(-cell.n // 8) or int(cell.hits or "0", 16) % (1 << -cell.n % 8)):
                 expected = f"{2 * -(-cell.n // 8)} hexadecimal digits, for {cell.n} episodes, and zeros after the last"
                 raise InputError(f"{where}.cells[{i}].hits", cell.hits, expected)
+            if (held := cell.damage) is not None:
+                if not 0.0 <= held.low <= held.value + CLOSE or not held.value - CLOSE <= held.high <= 1.0:
+                    raise InputError(f"{where}.cells[{i}].damage", held.model_dump(), "a share between its limits, from 0 to 1")
+                if cell.hits is not None and abs((share := int(cell.hits or "0", 16).bit_count() / cell.n) - held.value) > CLOSE:
+                    raise InputError(f"{where}.cells[{i}].damage.value", held.value, f"{share:g}, as its hits say")
         for i, curve in enumerate(board.curves):
             self._refer(f"{where}.curves[{i}]", curve, "defence")
             if curve.fitted and len(curve.fitted) != len(curve.points):
@@ -152,6 +164,15 @@ class _Agreement:
         for key in board.suite.shown:
             if key not in map(str, board.suite.doses):
                 raise InputError(f"{where}.suite.shown", key, self.known["dose"][1])
+
+    def _rank(self, entry: Entry, where: str) -> None:
+        """Raise InputError for a rank without the status, or in spite of a gate."""
+        if (entry.rank is None) == (entry.status == "ranked"):
+            raise InputError(f"{where}.rank", entry.rank and entry.rank.model_dump(), f"a rank exactly if ranked, and it is {entry.status}")
+        if entry.rank is not None and entry.rank.best > entry.rank.worst:
+            raise InputError(f"{where}.rank", entry.rank.model_dump(), "the best place first")
+        if entry.rank is not None and (lost := [gate.gate for gate in entry.gates if not gate.passed]):
+            raise InputError(f"{where}.gates", lost, "gates that a ranked entry passes")
 
     def _refer(self, where: str, line: Part, *fields: str) -> None:
         for name in fields:
