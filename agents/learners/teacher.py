@@ -13,7 +13,7 @@ from tailgate.base.errors import InputError
 from tailgate.core import Array, Attack, Command, draws
 from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import LoopState
-from tailgate.engine.agreement import ROWS, TRIED, apart, check_open
+from tailgate.engine.agreement import ROWS, apart, check_open
 from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Program
 from tailgate.engine.remembered import Remembered
@@ -143,4 +143,8 @@ _made: Remembered[Showing] = Remembered()
 
 def _difference(made: Showing) -> str:
     first = begun(made.seat, made.attack, made.plan, draws.keys("tune", range(ROWS)))
-    return apart(made.program, first, lambda held: decided(made.seat, made.attack, made.plan, held), min(TRIED, made.seat.decisions))
+
+    def later(held: Shown, steps: Array) -> Shown:
+        return held._replace(loop=made.seat.loop.later(held.loop, steps))
+
+    return apart(made.program, first, lambda held: decided(made.seat, made.attack, made.plan, held), made.seat.decisions, later)

@@ -298,6 +298,15 @@ class Loop:
         )  # fmt: skip
         return state, frame
 
+    def later(self, state: LoopState, steps: Array) -> LoopState:
+        """Return the state with its clock `steps` (B,) later, and with what is measured then: nothing drove in between."""
+        k = state.k + steps
+        sent, fresh = self._measure(state.keys, k, state.plant, state.controller, state.estimate)
+        link = state.link
+        if link is not None:
+            link, sent, fresh = self.link.step(link, sent, fresh, state.keys.at(Role.LINK, k))
+        return state._replace(k=k, sent=sent, received=fresh, link=link)
+
     def step(self, state: LoopState, attack: Attack[P, S], plan: P, memory: S) -> tuple[LoopState, S, Frame]:
         """Sense, decide and advance once. `plan` and `memory` are the attack's plan and state."""
         memory, command = attack.decide(plan, memory, self.sense(state), state.keys.at(Role.ATTACK, state.k))

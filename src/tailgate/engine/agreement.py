@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from tailgate.base.errors import InputError
-from tailgate.base.pytree import leaves, map_leaves
+from tailgate.base.pytree import leaves
 from tailgate.engine.operations import Array
 from tailgate.engine.untraceable import Untraceable
 
@@ -61,11 +61,13 @@ def raised(play: Callable[[], T]) -> T | str:
         return str(error)
 
 
-def apart(program: Program, begun: S, step: Callable[[S], tuple[S, Mapping[str, Array]]], horizon: int) -> str:
+def apart(
+    program: Program, begun: S, step: Callable[[S], tuple[S, Mapping[str, Array]]], horizon: int, later: Callable[[S, Array], S]
+) -> str:  # fmt: skip
     """Play some steps of a program without arguments, and the same by the plain `step`; return the first difference, or nothing.
 
-    begun: the state of ROWS episodes. step: returns the next state and its results.
-    In the second half of the steps, half the episodes go on at later steps: what begins late, such as an attack, is compared too.
+    begun: the state of ROWS episodes. step: returns the next state and its results. later: the state so many steps later (ROWS,).
+    In the second half of the steps, every other episode goes on at a later step: what begins late, such as an attack, is compared too.
     """
     steps = min(TRIED, horizon)
     state = program.rows(ROWS)
@@ -73,7 +75,7 @@ def apart(program: Program, begun: S, step: Callable[[S], tuple[S, Mapping[str, 
     call = program.call(state, 2)  # the form that plays: several steps, of which each is one
     for number in range(1, steps + 1):
         if number == steps // 2 + 1:
-            begun = _later(begun, horizon - steps)
+            begun = later(begun, np.linspace(0, horizon - steps, ROWS).astype(np.int64) * (np.arange(ROWS) % 2))
             state.put(begun)
         call.begin()
         call.play(1)
@@ -87,12 +89,6 @@ def apart(program: Program, begun: S, step: Callable[[S], tuple[S, Mapping[str, 
             if not same(got[name], held[name]):
                 return f"{name}, step {number}"
     return ""
-
-
-def _later(begun: S, most: int) -> S:
-    """Return the state with up to `most` steps more behind every other episode."""
-    names, more = iter(leaves(begun)), np.linspace(0, most, ROWS).astype(np.int64) * (np.arange(ROWS) % 2)
-    return map_leaves(lambda leaf: leaf + more if next(names) == "loop.k" else leaf, begun)
 
 
 def same(got: Array, wanted: Array) -> bool:

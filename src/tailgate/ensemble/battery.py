@@ -213,4 +213,8 @@ def _keys(batch: int) -> Keys:
 
 def _difference(made: Battery, few: object) -> str:
     first = begun(made.loop, _keys(ROWS), few)
-    return apart(made.program, first, lambda held: step(made.loop, made.attack, made.plan, held), made.loop.horizon)
+
+    def later(held: dict[str, Any], steps: Array) -> dict[str, Any]:
+        return held | {"loop": made.loop.later(held["loop"], steps)}
+
+    return apart(made.program, first, lambda held: step(made.loop, made.attack, made.plan, held), made.loop.horizon, later)

@@ -124,4 +124,7 @@ def _sensed(loop: Loop, begun: Episodes) -> Episodes:
 def _difference(rollout: Rollout) -> str:
     from tailgate.core import draws
 
-    return apart(rollout.program, rollout.begun(draws.keys("tune", range(ROWS))), rollout.plain, rollout.loop.horizon)
+    def later(held: Episodes, steps: Array) -> Episodes:
+        return held._replace(loop=rollout.loop.later(held.loop, steps))
+
+    return apart(rollout.program, rollout.begun(draws.keys("tune", range(ROWS))), rollout.plain, rollout.loop.horizon, later)
