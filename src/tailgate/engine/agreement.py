@@ -66,8 +66,8 @@ def apart(
 ) -> str:  # fmt: skip
     """Play some steps of a program without arguments, and the same by the plain `step`; return the first difference, or nothing.
 
-    begun: the state of ROWS episodes. step: returns the next state and its results. later: the state so many steps later (ROWS,).
-    In the second half of the steps, every other episode goes on at a later step: what begins late, such as an attack, is compared too.
+    begun: the state of ROWS episodes. step: returns the next state and its results. later: the state some steps (ROWS,) later.
+    In the second half of the steps, every other episode goes on at a later step. What begins late, such as an attack, is compared too.
     """
     steps = min(TRIED, horizon)
     state = program.rows(ROWS)
