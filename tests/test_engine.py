@@ -210,7 +210,7 @@ def test_the_comparison_with_the_plain_loop_reaches_late_steps():
 
 @pytest.mark.parametrize("scenario, defence, attack", [("radar-following-v0", "kf", "echo_delay:trigger=near,threshold=60,delay=60"), ("stop-and-go-v0", "chi2_kf", "dos_hold:start_step=90")])
 def test_an_attack_equals_the_plain_loop_at_late_steps(scenario, defence, attack):
-    """What a radar hears is measured again at the later step: else traced code, which measures in every row, would seem to differ."""
+    """At the later step the radar measures again. Traced code measures in every row, so an old reading would differ from it."""
     spec = Spec("defence", defence)
     loop = load_scenario(scenario).with_threat(budget=5).loop(spec.make(), spec.entry.uses)
     assert isinstance(rollout_of(loop, Spec("attack", attack).make()), Rollout)

@@ -353,7 +353,7 @@ def test_a_copy_is_drawn_as_its_original():
 
 
 def test_the_batch_of_stable_baselines_keeps_its_contract():
-    """Results of one row each are told apart from those that all share; unknown options are refused; pictures can be had."""
+    """Each row gets its own part of an array, and all rows the same card. Unknown options are refused. Each row has a picture."""
     pytest.importorskip("stable_baselines3")
     from tailgate.envs.gym.sb3 import BatchVecEnv
 

@@ -10,6 +10,7 @@ import pytest
 
 from tailgate.agents.scripts.scripted import Inject, Script
 from tailgate.base.errors import InputError, NotApplicable
+from tailgate.cli import main
 from tailgate.core.draws import keys
 from tailgate.core.registry import PARTS, Spec, entries, make
 from tailgate.core.scenario import load_scenario
@@ -176,3 +177,11 @@ def test_no_reading_may_be_certain_altogether():
 def test_a_discount_is_within_its_range(gamma):
     with pytest.raises(InputError, match=r"reward\.gamma"):
         Seat.make(gamma=gamma)
+
+
+def test_an_attack_whose_commands_are_refused_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["evaluate", "--scenario", "thesis-ch4-v0", "--dose", "none", "--seeds", "2", "--threat", "kinds=[fdi]", "--defence", "kf", "--attack"]
+    assert main([*words, "fdi_then_jam:inject=20"]) == 0
+    half = capsys.readouterr().err
+    assert "fdi_then_jam:inject=20 in thesis-ch4-v0: " in half and "of its commands are refused" in half
+    assert main([*words, "fdi"]) == 0 and "refused" not in capsys.readouterr().err

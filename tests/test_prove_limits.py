@@ -1,4 +1,4 @@
-"""What a proof covers: the last step, each limit of a command, a loop at rest, and systems that are linear."""
+"""A proof covers the last step and each limit of a command. A loop at rest is at rest. Systems that are not linear are refused."""
 
 import dataclasses
 

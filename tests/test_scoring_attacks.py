@@ -5,13 +5,16 @@ import json
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tailgate.base.errors import InputError
 from tailgate.board import admit, read_attacks, score, withdraw
+from tailgate.board.admission import against_all
 from tailgate.cli import main
 from tailgate.core.scenario import load_suite
 from tailgate.evaluation.attack_list import Admitted, append, attacks_of, next_level, published, standing
+from tailgate.evaluation.paired import mcnemar
 from tailgate.evaluation.rows import read_rows
 
 ROOT = Path(__file__).parents[1]
@@ -168,3 +171,13 @@ def test_a_board_asks_every_defence_for_what_was_admitted_and_forgets_what_was_t
         assert next(e for e in made["entries"] if e["defence"] == "chi2_kf")["rates"][0]["undamaged"]["value"] == value
     assert "erratum" in next(a["note"] for a in made["attacks"] if a["attack"] == LINE.attack)
     assert json.dumps(made, allow_nan=False)
+
+
+def test_an_attack_has_to_beat_every_listed_one() -> None:
+    """Nested in the new one, the listed attack with most damage is beaten surely; another one, which does less, is not."""
+    new = np.repeat([1.0, 0.0], [40, 60])
+    nested, other = np.repeat([1.0, 0.0], [30, 70]), np.repeat([0.0, 1.0, 0.0], [20, 45, 35])
+    assert against_all(new, [nested])[1]["p"] == mcnemar(10, 0) < 0.01
+    best, found = against_all(new, [nested, other])
+    assert best == 1 and found["p"] == 1.0 and (found["only_new"], found["only_worst"]) == (20, 25)
+    assert against_all(new, []) == (None, {"only_new": 40, "only_worst": 0, "p": mcnemar(40, 0)})

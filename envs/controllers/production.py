@@ -6,10 +6,10 @@
     u = min(u_gap, u_even, u_stop, k_set (v_set - v))
 
 u_even ends the approach at d_near, u_stop stops there if the car ahead brakes to a stop. The command keeps within ISO 15622's limits,
-which depend on the speed: acceleration 4 to 2, braking 5 to 3.5 m/s^2, growth of braking 5 to 2.5 m/s^3, each linear between 5 and
-20 m/s. The standard limits means over 1 to 2 s; here every command of the law keeps to them. What a
-defence asks for (BRAKE, STOP, other limits) acts behind the law, at once. Gains, delay and standstill of the default lie near those
-that `tailgate fit` finds for one law of all recorded cars.
+which depend on the speed: acceleration 4 to 2, braking 5 to 3.5 m/s^2, growth of braking 5 to 2.5 m/s^3, each linear between 5 and 20
+m/s. The standard limits means over 1 to 2 s; here every command of the law keeps to them. What a defence asks for (BRAKE, STOP, other
+limits) acts behind the law, at once. Gains, delay and standstill of the default lie near those that `tailgate fit` finds for one law of
+all recorded cars.
 """
 
 from dataclasses import dataclass

@@ -74,8 +74,8 @@ class BatchVecEnv(VecEnv):
         return self._by_row(getattr(self.batch, method_name)(*args, **kwargs), indices)
 
     def _by_row(self, value: Any, indices: VecEnvIndices) -> list[Any]:
-        """Return the parts of an array of all rows, or what they share."""
-        of_rows = isinstance(value, np.ndarray | tuple | list) and len(value) == self.num_envs
+        """Return the parts of an array (B, ...), or what all rows share."""
+        of_rows = isinstance(value, np.ndarray) and value.shape[:1] == (self.num_envs,)
         return [value[i] if of_rows else value for i in self._get_indices(indices)]
 
     def get_images(self) -> list[Array]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from tailgate.base.errors import InputError, unknown
 from tailgate.base.files import writable_directory, write_atomic
+from tailgate.core import Array
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite
 from tailgate.ensemble.search import FINAL
@@ -43,6 +44,18 @@ def knowledge_of(text: str, suite: Suite) -> str:
     """Return the knowledge that a suite grants an attack."""
     spec = Spec("attack", text)
     return suite.knowledge or str(getattr(spec.make(), "knowledge", spec.entry.knowledge))
+
+
+def against_all(x: Array, listed: Sequence[Array]) -> tuple[int | None, dict[str, Any]]:
+    """Return the listed attack that a new one, with damage x (episodes,), surpasses least surely, and the exact paired test.
+
+    The largest p counts, because nobody knows which listed attack is the worst. Without any the test is against no damage, and None.
+    """
+    tests = []
+    for i, y in enumerate(listed) if listed else [(None, np.zeros_like(x))]:
+        new, old = int(np.sum(x > y)), int(np.sum(y > x))
+        tests.append((i, {"only_new": new, "only_worst": old, "p": mcnemar(new, old) if new > old else 1.0}))
+    return max(tests, key=lambda test: test[1]["p"])
 
 
 def admit(
@@ -98,18 +111,13 @@ def admit(
         others = [k for k in played if k not in mine]
         for k in mine:
             seeds, x = worst.harm(k, 0)
-            p, best, new, old = mcnemar(int(x.sum()), 0), None, int(x.sum()), 0  # against no attack at all
-            for other in others:  # the largest p counts: which listed attack is the worst, nobody knows
-                held, y = worst.harm(other, 0)
-                if held != seeds:
-                    raise InputError(f"scenarios of {suite.name}", len(held), "the same seeds in each")
-                more, less = int(np.sum(x > y)), int(np.sum(y > x))
-                found = mcnemar(more, less) if more > less else 1.0
-                if best is None or found > p:
-                    p, best, new, old = found, other, more, less
+            held = [worst.harm(other, 0) for other in others]
+            if any(their != seeds for their, _ in held):
+                raise InputError(f"scenarios of {suite.name}", "other seeds", "the same seeds in each")
+            best, found = against_all(x, [y for _, y in held])
             tests.append({
-                "defence": defence, "scenario": worst.pairs[k][0], "dose": at, "worst": None if best is None else worst.named(best),
-                "episodes": len(x), "only_new": new, "only_worst": old, "p": p,
+                "defence": defence, "scenario": worst.pairs[k][0], "dose": at,
+                "worst": None if best is None else worst.named(others[best]), "episodes": len(x), **found,
             })  # fmt: skip
     if not tests:
         raise InputError("attack", attack, "one that can be played against some of the defences")

@@ -256,8 +256,8 @@ def with_check(data: Data, report: Data) -> Data:
     """Return the board with a check: `checked` in the entries that were looked into, fingerprints in cells that came out equal.
 
     An entry keeps the check that played more cells, or found a difference that no whole check has refuted. One of another number of cells
-    is of another board. Comparisons that were bounds are
-    made again of cells that now say which episodes came to damage, and ranks with them.
+    is of another board. Comparisons that were bounds are made again of cells that now say which episodes came to damage, and ranks with
+    them.
     """
     before = {entry["defence"]: entry.get("checked") for entry in data["entries"]}
     checked: dict[str, Data] = {}

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import functools
-import re
 from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from tailgate.core.registry import PARTS, Entry, Family, built_in
+from tailgate.core.registry import Entry, Family, Spec, built_in
 from tailgate.core.scenario import Suite
-from tailgate.core.spec_text import split_items, split_text
+from tailgate.core.spec_text import split_text
 from tailgate.evaluation.paired import class_of
 from tailgate.evaluation.rounds import numbered
 from tailgate.evaluation.rows import CLEAN, Row
@@ -38,9 +37,6 @@ def middle(suite: Suite) -> int:
     """Return the index of the middle one of the doses that are shown; of all where none is named."""
     chosen = shown(suite)
     return chosen[len(chosen) // 2]
-
-NAMED_CLASS = re.compile(r"[\w.]:[A-Za-z_]\w*(?![\w.]*=)")  # module:Class, also of a part: composed:detector=module:Class
-
 
 def shown(suite: Suite) -> list[int]:
     """Return indices of the doses that rates are shown at."""
@@ -133,10 +129,8 @@ def curves(levels: dict[str, Worst]) -> list[Data]:
 
 def _card(defence: str) -> Entry | None:
     """Return the card of a built-in defence. What runs somebody else's code has none, as a board must not import what a row names."""
-    head, params = split_text(defence)
-    given = dict(item.partition("=")[::2] for item in split_items(params))
-    strangers = any(given[part].strip() not in _built_in(part) for part in PARTS if part in given)
-    return None if strangers or NAMED_CLASS.search(defence) else _built_in("defence").get(head)
+    named = Spec("defence", defence).named()
+    return None if any(name not in _built_in(family) for family, name in named) else _built_in("defence")[named[0][1]]
 
 
 @functools.cache

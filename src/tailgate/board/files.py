@@ -144,7 +144,7 @@ class _Agreement:
             if (held := cell.damage) is not None:
                 if not 0.0 <= held.low <= held.value + CLOSE or not held.value - CLOSE <= held.high <= 1.0:
                     raise InputError(f"{where}.cells[{i}].damage", held.model_dump(), "a share between its limits, from 0 to 1")
-                if cell.hits is not None and abs((share := int(cell.hits or "0", 16).bit_count() / cell.n) - held.value) > CLOSE:
+                if cell.hits and cell.n and abs((share := int(cell.hits, 16).bit_count() / cell.n) - held.value) > CLOSE:
                     raise InputError(f"{where}.cells[{i}].damage.value", held.value, f"{share:g}, as its hits say")
         for i, curve in enumerate(board.curves):
             self._refer(f"{where}.curves[{i}]", curve, "defence")

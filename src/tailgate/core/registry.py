@@ -257,7 +257,7 @@ class Spec:
             put_in(params, key.strip(), scalar(value))
         return head, params
 
-    def _named(self) -> list[tuple[Family, str]]:
+    def named(self) -> list[tuple[Family, str]]:
         """Return family and name of the component and of its parts."""
         head, params = self._parts()
         named: list[tuple[Family, Any]] = [(self.family, head)]
@@ -268,11 +268,11 @@ class Spec:
 
     def _imported(self) -> list[tuple[Family, str]]:
         """Return family and module:Class of everything that this text imports."""
-        return [(family, name) for family, name in self._named() if ":" in name]
+        return [(family, name) for family, name in self.named() if ":" in name]
 
     def _plugged(self) -> list[tuple[Family, str]]:
         """Return family and name of every plug-in that this text names, as a part too."""
-        return [(family, name) for family, name in self._named() if name in _plugged(entry_points, GROUPS[family])]
+        return [(family, name) for family, name in self.named() if name in _plugged(entry_points, GROUPS[family])]
 
     def refuse_imports(self, where: str) -> None:
         """Raise InputError when this names a class to import: configuration files never run code."""
