@@ -1,9 +1,10 @@
 """Make a board whose searches take longer than one sitting. Finished searches stay in results/under-way, and the next sitting goes on.
 
-    python benchmarks/board_in_parts.py road-v0 [--hours 2] [--workers 2]
+    python benchmarks/board_in_parts.py road-v0 [--hours 2] [--workers 2] [--defence NAME]
 
 Searches belong to the code that made them. The first sitting notes the commit, and each sitting plays in a work tree of that commit, below
 .under-way. A sitting ends after some hours, or when the board is there: .under-way/SUITE/results/SUITE then goes to results by hand.
+The board's rows come before its searches; a sitting with --defence has the searches alone.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ def main() -> int:
     parser.add_argument("suite", help="a built-in suite")
     parser.add_argument("--hours", type=float, default=2.0, help="length of this sitting (default 2)")
     parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
+    parser.add_argument("--defence", action="append", default=[], help="search against this one alone, and play no other rows; repeatable")
     options = parser.parse_args()
     kept, tree = ROOT / "results" / "under-way" / options.suite, ROOT / ".under-way" / options.suite
     commit = commit_of(kept)
@@ -42,14 +44,24 @@ def main() -> int:
         with tarfile.open(part) as held:
             held.extractall(tree, filter="data")
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it, and would pass that on
-    command = [sys.executable, "-m", "tailgate", "leaderboard", "run", options.suite, "--out", "results", "--train"]
-    environment = os.environ | {"PYTHONPATH": str(tree / "src")}
-    run = subprocess.Popen([*command, "--workers", str(options.workers)], cwd=tree, env=environment)
+    whole = ["run", options.suite, "--out", "results", "--train"]
+    parts = [["attack", name, "--suite", options.suite, "--out", f"results/{options.suite}/attacked"] for name in options.defence]
     until = time.monotonic() + 3600 * options.hours
+    for part in parts or [whole]:
+        sit([sys.executable, "-m", "tailgate", "leaderboard", *part, "--workers", str(options.workers)], tree, options.suite, kept, until)
+    print(f"{len(list(kept.glob('*.tar.xz')))} searches in {kept.relative_to(ROOT)}")
+    return 0
+
+
+def sit(command: list[str], tree: Path, suite: str, kept: Path, until: float) -> None:
+    """Run a command in the work tree until it ends or the time is up, and keep the searches that it finishes."""
+    if time.monotonic() >= until:
+        return
+    run = subprocess.Popen(command, cwd=tree, env=os.environ | {"PYTHONPATH": str(tree / "src")})
     try:
         while run.poll() is None and time.monotonic() < until:
             time.sleep(PAUSE)
-            keep(tree, options.suite, kept)
+            keep(tree, suite, kept)
     finally:
         if run.poll() is None:
             run.send_signal(signal.SIGINT)
@@ -57,9 +69,7 @@ def main() -> int:
             run.wait(PATIENCE)
         except subprocess.TimeoutExpired:
             run.kill()
-        keep(tree, options.suite, kept)
-    print(f"{len(list(kept.glob('*.tar.xz')))} searches in {kept.relative_to(ROOT)}")
-    return 0
+        keep(tree, suite, kept)
 
 
 def commit_of(kept: Path) -> str:

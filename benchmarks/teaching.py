@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO
 
+from tailgate.agents.learners.learning import SEED_STRIDE
 from tailgate.base.errors import NotApplicable
 from tailgate.base.files import write_atomic
 from tailgate.core.draws import keys
@@ -58,8 +59,9 @@ def damage(name: str, act: Callable[[AdversaryVectorEnv, Any], Any]) -> float:
 def learned(name: str, seed: int) -> tuple[float, float]:
     """Train with Stable-Baselines3's defaults in batches that suit a vector environment; return the damage and the seconds."""
     begun = time.perf_counter()
-    env = BatchVecEnv(64, name)
+    env = BatchVecEnv(64, name, horizon_ends=True)
     model = PPO("MlpPolicy", env, n_steps=64, batch_size=1024, learning_rate=1e-3, seed=seed, device="cpu")
+    env.seed(seed * SEED_STRIDE)  # else the rows of two trainings would share episodes
     model.learn(DECISIONS.get(kind(name), 150_000))
     took = time.perf_counter() - begun
     return damage(name, lambda _, seen: model.predict(seen, deterministic=True)[0]), took

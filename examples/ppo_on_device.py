@@ -34,7 +34,7 @@ if args.device == "cpu":
     torch.set_num_threads(1)
 envs = TensorVecEnv(
     args.envs, device=args.device, autoreset="same_step", scenario="gusty-stop-and-go-v0", defence="chi2_kf",
-    action="mode", value=-3.0, interval=10, gamma=args.gamma, gap_shaping=0.0, error_shaping=0.0,
+    action="mode", value=-3.0, interval=10, gamma=args.gamma, gap_shaping=0.0, error_shaping=0.0, horizon_ends=True,
     threat={"kinds": ["dos_jam", "fdi"], "fdi_bound": 3.0, "budget": 20},
 )  # fmt: skip
 device, features, actions = envs.device, envs.single_observation_space.shape[0], int(envs.single_action_space.n)
@@ -73,11 +73,8 @@ for update in range(1, updates + 1):
             gumbel = -torch.log(-torch.log(torch.rand_like(logits).clamp(1e-9, 1.0 - 1e-6)))
             action = torch.argmax(logits + gumbel, dim=1)  # a sample of the softmax
             observations[t], taken[t], before[t], values[t] = observation, action, chosen(logits, action), critic(observation).squeeze(1)
-            observation, reward, terminated, truncated, info = envs.step(action)
-            rewards[t], ends[t] = reward, terminated | truncated
-            if "final_obs" in info:  # the time limit is not the end of the task: add the value of what would have come
-                rewards[t] += args.gamma * critic(info["final_obs"]).squeeze(1) * truncated
-            counts += torch.stack([(terminated | truncated).sum(), terminated.sum()])
+            observation, rewards[t], ends[t], _, info = envs.step(action)
+            counts += torch.stack([ends[t].sum().long(), (info["collided"] | info["rear_collided"]).sum()])
         advantages, running = torch.zeros(shape, device=device), torch.zeros(args.envs, device=device)
         following = critic(observation).squeeze(1)
         for t in reversed(range(args.rollout)):  # generalised advantage estimation

@@ -31,7 +31,7 @@ torch.set_num_threads(1)
 torch.manual_seed(args.seed)
 envs = gymnasium.make_vec(
     "tailgate:tailgate/CarFollowing-v0", num_envs=args.envs, autoreset="same_step", scenario="gusty-stop-and-go-v0", defence="chi2_kf",
-    action="mode", value=-3.0, interval=10, gamma=args.gamma, gap_shaping=0.0, error_shaping=0.0,
+    action="mode", value=-3.0, interval=10, gamma=args.gamma, gap_shaping=0.0, error_shaping=0.0, horizon_ends=True,
     threat={"kinds": ["dos_jam", "fdi"], "fdi_bound": 3.0, "budget": 20},
 )  # fmt: skip
 features, actions = envs.single_observation_space.shape[0], int(envs.single_action_space.n)
@@ -63,14 +63,9 @@ for update in range(1, max(1, args.steps // (args.envs * args.rollout)) + 1):
             policy = torch.distributions.Categorical(logits=actor(obs))
             action = policy.sample()
             obs_buf[t], act_buf[t], logp_buf[t], val_buf[t] = obs, action, policy.log_prob(action), critic(obs).squeeze(1)
-        following, reward, terminated, truncated, info = envs.step(action.numpy())
-        rewards = torch.as_tensor(reward, dtype=torch.float32)
-        if truncated.any():  # the time limit is not the end of the task: add the value of what would have come
-            with torch.no_grad():
-                tail = critic(torch.as_tensor(info["final_obs"])).squeeze(1)
-            rewards = rewards + args.gamma * tail * torch.as_tensor(truncated)
-        rew_buf[t], done_buf[t] = rewards, torch.as_tensor(terminated | truncated, dtype=torch.float32)
-        ended, crashed = ended + int((terminated | truncated).sum()), crashed + int(terminated.sum())
+        following, reward, terminated, _, info = envs.step(action.numpy())
+        rew_buf[t], done_buf[t] = torch.as_tensor(reward), torch.as_tensor(terminated)
+        ended, crashed = ended + int(terminated.sum()), crashed + int((info["collided"] | info["rear_collided"]).sum())
         obs = torch.as_tensor(following)
 
     with torch.no_grad():  # generalised advantage estimation, backwards

@@ -281,7 +281,7 @@ CHANGES = [
     {"threat": {"sees_measurement": True}}, {"action": "timing"}, {"kind": "dropout"}, {"value": -3.0}, {"rate": 0.4},
     {"per_sensor": True}, {"per_agent": True}, {"error_scale": 5.0}, {"interval": 2}, {"reward": "error"}, {"gap_shaping": 0.1}, {"error_shaping": 0.1}, {"gamma": 0.9},
     {"illegal_penalty": 0.2}, {"shares": [0.5, 1.0]},
-    {"attack_cost": 0.1}, {"steps": 7}, {"power": 0.05}, {"delay": 3.0},
+    {"attack_cost": 0.1}, {"steps": 7}, {"power": 0.05}, {"delay": 3.0}, {"horizon_ends": True},
 ]  # fmt: skip
 
 

@@ -95,7 +95,7 @@ def test_help_lists_every_nested_key_with_its_default(command: str, folder: str,
         places |= {name: (learner_of(name).Config,) for name in LEARNERS}
     else:
         places |= {"attacker": (cem.Config,), "defender": (cem.Config,), "menu": (Menu,), "payoff": (Payoff,)}
-    elsewhere = {"environment.gamma", "menu.interval"}  # gamma is a key itself; environment.interval is that of the menu
+    elsewhere = {"environment.gamma", "environment.horizon_ends", "menu.interval"}  # keys themselves; environment.interval is that of the menu
     fields = {f"{place}.{name}": field for place, kinds in places.items() for kind in kinds for name, field in fields_of(kind).items()}
     held = load_yaml(config_path(folder or ".", preset, "config"))
     found = known(help_of(command))

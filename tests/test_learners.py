@@ -91,6 +91,22 @@ def test_it_learns_when_to_attack(name: str, decisions: int, paid: dict[str, Any
     assert [entry["steps"] for entry in run.curve] == sorted({entry["steps"] for entry in run.curve}) and len(run.curve) > 3
 
 
+def test_ppo_expects_nothing_behind_a_horizon_that_ends(paid: dict[str, Any]) -> None:
+    """The buffer of Stable-Baselines3 holds the rewards of the environment; at a horizon that truncates, it adds a guess of what follows."""
+    for ends in (True, False):
+        run = learner("ppo", paid | {"horizon_ends": ends})
+        wait, paid_out = run.env.step_wait, []
+
+        def step_wait() -> Any:
+            out = wait()  # noqa: B023
+            paid_out.append(out[1].copy())  # noqa: B023 - it adds in place
+            return out
+
+        run.env.step_wait = step_wait
+        run.learn(PPO["envs"] * PPO["rollout"], lambda progress: None)
+        assert np.array_equal(run.model.rollout_buffer.rewards, paid_out) == ends
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "least"), [("sac", 1.0), ("tqc", 0.35)])
 def test_it_learns_what_to_inject(name: str, least: float, paid: dict[str, Any], tmp_path: Path) -> None:

@@ -9,9 +9,11 @@ import pytest
 from tailgate.base.errors import InputError
 from tailgate.core.draws import Role, keys
 from tailgate.core.registry import Spec
+from tailgate.core.scenario import load_scenario
 from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.envs.gym.gymnasium_env import AdversaryVectorEnv
 from tailgate.envs.gym.rewards import NEAR, Reward
+from tailgate.envs.gym.sb3 import BatchVecEnv
 from tailgate.play.metrics import METRICS
 from tailgate.play.trace import rollout
 
@@ -35,13 +37,14 @@ def _episode(interval=1, shaped=True, **options):
             return
 
 
+@pytest.mark.parametrize("ends", [False, True])
 @pytest.mark.parametrize("interval", [1, 5])
 @pytest.mark.parametrize("reward", ["collision", "min_gap", "error", "stealth"])
 @pytest.mark.thin(4)
-def test_shaping_telescopes(reward, interval):
-    """The discounted sum of what shaping adds is gamma^T Phi(end) - Phi(start), Phi(end) = 0 at a collision: no policy gains."""
+def test_shaping_telescopes(reward, interval, ends):
+    """Shaping adds gamma^T Phi(end) - Phi(start) in all. Phi(end) is 0 at an end for good, so no policy gains; a cut-off end keeps it."""
     total, discount = np.zeros(8), 1.0
-    episode = _episode(reward=reward, gamma=0.97, interval=interval)
+    episode = _episode(reward=reward, gamma=0.97, interval=interval, horizon_ends=ends)
     (shaped, _), _ = next(episode)
     start = shaped.tally.potential.copy()
     assert start.min() > 0.05
@@ -49,6 +52,7 @@ def test_shaping_telescopes(reward, interval):
         total += discount * (one[1] - two[1])
         discount *= 0.97
         terminated = one[2]
+    assert (terminated ^ one[3]).all() and (terminated.all() if ends else one[3].any())
     end = np.where(terminated, 0.0, shaped.tally.potential)
     np.testing.assert_allclose(total, discount * end - start, atol=1e-12)
 
@@ -74,6 +78,23 @@ def test_raw_rewards(interval):
     assert (paid["error"] > 0).all()
     if interval == 1:
         np.testing.assert_allclose(paid["error"] - paid["stealth"], alarms, atol=1e-9)
+
+
+@pytest.mark.parametrize("engine", ["plain", "auto"])
+def test_a_collision_pays_once_where_it_ends_nothing(engine):
+    """Cars that overlap for many steps have collided once; Stable-Baselines3's information counts the episode as one with a collision."""
+    scenario = dataclasses.replace(load_scenario("gusty-stop-and-go-v0"), ends_on_collision=False)
+    arguments = {"scenario": scenario, "defence": "kf", "value": -20.0, "interval": 20, "engine": engine, "reward": "collision"}
+    env = BatchVecEnv(8, **arguments, gap_shaping=0.0, error_shaping=0.0)
+    env.reset()
+    earned, overlapping, told = np.zeros(8), np.zeros(8), None
+    while not told:
+        _, reward, done, infos = env.step(np.ones(8, int))
+        earned += reward
+        overlapping += env.batch.episodes.facts().damage <= 0.0
+        told = infos if done.all() else None
+    assert overlapping.max() > 2 and set(earned) == {1.0}, (earned, overlapping)
+    assert all(info["episode"]["crashed"] and info["TimeLimit.truncated"] for info in told)
 
 
 @pytest.mark.long

@@ -16,13 +16,12 @@ from tailgate.agents.policy.zoo import ZooAttack, zoo_card, zoo_names, zoo_path
 from tailgate.base.errors import InputError
 from tailgate.core import draws
 from tailgate.core.registry import Spec
-from tailgate.core.schema import build
 from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.evaluation.cells import evaluate
 from tailgate.play.trace import rollout
 from tailgate.studies.collect import BYTES, POINTS, add_policy, add_run, single, thinned
 from tailgate.studies.policies import loop_for, trained
-from tailgate.training.train import TrainConfig, environment_of
+from tailgate.training.train import environment_of, recorded
 
 ROOT = Path(__file__).parents[1]
 RUN = ROOT / "results" / "quickstart-v0"
@@ -58,7 +57,7 @@ def test_every_policy_has_its_record_and_is_small(name: str) -> None:
 def test_the_recorded_environment_is_that_of_its_record(name: str) -> None:
     """The hash is that of the environment which the training's configuration makes today: it can be trained again as it was."""
     record = load_policy(zoo_path(name))[0].training
-    config = build(TrainConfig, {key: value for key, value in record["config"].items() if key != "class"}, name)
+    config = recorded(record["config"])
     assert Seat.make(gamma=config.gamma, **environment_of(config)).card()["hash"] == record["environment"]
 
 

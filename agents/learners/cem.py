@@ -280,7 +280,7 @@ class Learner(Search):
             action = np.argmax(x, axis=1) if seat.action.discrete else np.clip(x, -1.0, 1.0)
             outcome = play.decide(action, over, restart=False)
             total += weight * outcome.reward
-            crashed |= outcome.terminated
+            crashed |= outcome.collided | outcome.rear_collided
             over = over | outcome.terminated
             weight *= seat.reward.gamma
         return total, crashed

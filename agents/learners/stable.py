@@ -151,7 +151,7 @@ class StableLearner:
 
     def _facts(self) -> dict[str, Any]:
         """Return the facts on which a checkpoint and the run that loads it must agree."""
-        form = f"tailgate-{self.name}-checkpoint-2"
+        form = f"tailgate-{self.name}-checkpoint-3"
         return {"format": form, "seed": self.seed, "card": self.env.batch.card()["hash"], "learner": self.identity}
 
     def _parts(self) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
@@ -175,8 +175,8 @@ class StableLearner:
         _, words, position, _, _ = np.random.get_state()  # noqa: NPY002 - Stable-Baselines3 shuffles and samples with it
         arrays: dict[str, Any] = {
             **{f"batch.{name}": value for name, value in batch.episodes.held().items()},
-            "env.returns": self.env._returns, "env.lengths": self.env._lengths, "last_obs": model._last_obs,
-            "last_starts": model._last_episode_starts, "numpy": words, **{f"held.{name}": value for name, value in self.held().items()},
+            "env.returns": self.env._returns, "env.lengths": self.env._lengths, "env.crashed": self.env._crashed,
+            "last_obs": model._last_obs, "last_starts": model._last_episode_starts, "numpy": words, **{f"held.{name}": value for name, value in self.held().items()},
         }  # fmt: skip
         for name, array in arrays.items():
             whole = np.array(array, order="C")  # torch has no unsigned integers of 32 and 64 bits: keep their bits
@@ -236,6 +236,7 @@ class StableLearner:
         batch.episodes.put({name: restored(f"batch.{name}", value) for name, value in batch.episodes.held().items()})
         self.env._returns[:] = tensors["env.returns"].numpy()
         self.env._lengths[:] = tensors["env.lengths"].numpy()
+        self.env._crashed[:] = tensors["env.crashed"].numpy()
         model._last_obs = tensors["last_obs"].numpy().copy()
         batch.observed = tensors["last_obs"].numpy().copy()
         model._last_episode_starts = tensors["last_starts"].numpy().copy()
@@ -252,7 +253,7 @@ class _Reporter(BaseCallback):
     def _on_step(self) -> bool:
         for info in self.locals["infos"]:
             if info:
-                self.learner.ended.append((not info["TimeLimit.truncated"], info["episode"]["r"]))
+                self.learner.ended.append((info["episode"]["crashed"], info["episode"]["r"]))
         return True
 
     def _on_rollout_start(self) -> None:  # the update of the last rollout is done
@@ -321,7 +322,7 @@ class OffPolicyConfig:
 
 
 class OffPolicyLearner(StableLearner):
-    """A learner with a replay buffer. The horizon ends an episode for good: the observation shows it coming."""
+    """A learner with a replay buffer. Every end of an episode is one for good: the observation shows the horizon coming."""
 
     algorithm: ClassVar[Any]
     config: OffPolicyConfig

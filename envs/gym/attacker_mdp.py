@@ -30,8 +30,8 @@ FACES: dict[str, dict[str, Any]] = {  # defaults of each id
     "tailgate/LaneKeeping-v0": {"scenario": "lane-keeping-v0", "defence": "chi2_kf", "value": 0.5},
     "tailgate/Highway-v0": {"scenario": "highway-v0", "defence": "chi2_kf"},
 }
-SHAPING = {"gap_shaping", "error_shaping"}
-_LEARN: dict[str, Any] = dict.fromkeys(sorted(SHAPING), 0.0)
+RETURN = {"gap_shaping", "error_shaping", "horizon_ends"}  # options that go with a reward that is given as an object, too
+_LEARN: dict[str, Any] = {"error_shaping": 0.0, "gap_shaping": 0.0}
 FACES |= {  # tasks that are worth learning: a budget, decisions that last, no shaping
     "tailgate/CarFollowing-v1": _LEARN | {
         "scenario": "gusty-stop-and-go-v0", "defence": "chi2_kf", "value": -3.0, "interval": 20,
@@ -64,6 +64,7 @@ class Tally(NamedTuple):
     least: Array  # smallest gap so far, within the reward's reach [m]
     error: Array  # largest error of an agent, where there is no road
     peak: Array  # the largest of the episode so far, where the reward is for that
+    crashed: Array  # bool: there was a collision
 
 
 class Sums(NamedTuple):
@@ -84,12 +85,12 @@ class Outcome(NamedTuple):
     collided: Array
     rear_collided: Array
     illegal: Array  # a command was refused, and in no step of the decision one was accepted
-    terminated: Array  # a collision ended the episode
-    truncated: Array  # the horizon did
+    terminated: Array  # a collision ended the episode, or the horizon where it `horizon_ends`
+    truncated: Array  # the horizon cut it off
 
 
 def _reward(options: dict[str, Any]) -> Reward:
-    """Return the reward from its options; or the object given in their place, with the shaping of the options: ids of `-v1` set it."""
+    """Return the reward from its options; or the object given in their place, with the options of RETURN: ids of `-v1` set the shaping."""
     own = options.get("reward")
     if isinstance(own, Payment):
         rest = build(Reward, {key: value for key, value in options.items() if key != "reward"}, "reward")
@@ -98,10 +99,10 @@ def _reward(options: dict[str, Any]) -> Reward:
         return build(Reward, options, "reward")
     if not isinstance(own, Reward):
         raise InputError("reward", own, "a name (tailgate list rewards), or an object of a subclass of Payment or Reward")
-    for key in options.keys() - {"reward"} - SHAPING:
+    for key in options.keys() - {"reward"} - RETURN:
         raise InputError(key, options[key], f"no such option: {type(own).__name__}, the reward given as an object, holds it")
-    shaping = {key: value for key, value in options.items() if key in SHAPING}
-    return dataclasses.replace(own, **shaping) if shaping else own
+    changed = {key: value for key, value in options.items() if key in RETURN}
+    return dataclasses.replace(own, **changed) if changed else own
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -193,7 +194,8 @@ class Seat:
     def begin(self, state: LoopState) -> Tally:
         """Return the reward's memory of episodes that have just begun."""
         gap = self._room(self.loop.plant.scene(self.loop.plan.plant, state.plant).gap)
-        return Tally(self.reward.potential(gap), self.reward.least(gap), np.zeros(len(gap)), np.zeros(len(gap)))
+        none = np.zeros(len(gap))
+        return Tally(self.reward.potential(gap), self.reward.least(gap), none, none, np.zeros(len(gap), bool))
 
     def _room(self, gap: Array) -> Array:
         """Return the gap (B, N) [m] that the reward is for: in a lane, half of its width counts as NEAR."""
@@ -236,7 +238,8 @@ class Seat:
         least, peak, largest = reward.least(gap, tally.least), tally.peak, tally.error
         if reward.payment.peak:
             peak = np.maximum(np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1), peak)
-        gained = reward(loop.model, frame, tally.least - least, frame.k == loop.horizon, peak - tally.peak)
+        new = frame._replace(collided=frame.collided & ~tally.crashed, rear_collided=frame.rear_collided & ~tally.crashed)
+        gained = reward(loop.model, new, tally.least - least, frame.k == loop.horizon, peak - tally.peak)
         potential = np.where(live, reward.potential(gap, self._believed(frame)), tally.potential)
         if not self.road:
             largest = np.where(live, np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1), largest)
@@ -245,12 +248,13 @@ class Seat:
             sums.rear_collided | (frame.rear_collided & live), sums.refused | (frame.refused & live),
             sums.accepted | (frame.command.kind != Kind.NONE),  # also behind a collision, which no mask foresees
         )  # fmt: skip
-        return state, Tally(potential, least, largest, peak), sums, frame
+        return state, Tally(potential, least, largest, peak, tally.crashed | frame.collided | frame.rear_collided), sums, frame
 
     def closed(self, state: LoopState, tally: Tally, sums: Sums, over: Array) -> Outcome:
         """Return the outcome of a decision, after its last step."""
         illegal = sums.refused & ~sums.accepted
-        terminated = state.ended & ~over
-        truncated = ~terminated & ~over & (state.k > self.loop.horizon)
+        late = state.k > self.loop.horizon
+        ended = state.ended | late if self.reward.horizon_ends else state.ended
+        terminated, truncated = ended & ~over, late & ~ended & ~over
         gained = np.where(over, 0.0, self.reward.decided(sums.raw, illegal, sums.begun, tally.potential, terminated))
         return Outcome(gained, sums.collided, sums.rear_collided, illegal, terminated, truncated)

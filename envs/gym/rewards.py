@@ -46,7 +46,7 @@ class Step:
 
     @property
     def crashed(self) -> Array:
-        """(B,) bool: a collision in front or behind."""
+        """(B,) bool: a collision in front or behind, the first of the episode."""
         return self.frame.collided | self.frame.rear_collided
 
     @property
@@ -69,7 +69,7 @@ class Payment:
 
 @register("reward", "collision")
 class Collision(Payment):
-    """1 at a collision in front or behind."""
+    """1 at the first collision in front or behind."""
 
     road = True
 
@@ -79,7 +79,7 @@ class Collision(Payment):
 
 @register("reward", "min_gap")
 class MinGap(Collision):
-    """1 at a collision, and the metres by which the smallest gap of the episode falls below 20 m, over 20 m.
+    """1 at the first collision, and the metres by which the smallest gap of the episode falls below 20 m, over 20 m.
 
     A burst at the right moment earns something long before it makes a collision.
     """
@@ -129,7 +129,8 @@ class Reward:
 
     The field `reward` names the payment of a step (the subclasses of `Payment`). The shaping terms are potential-based (Ng, Harada,
     Russell 1999): they leave the best policy unchanged when `gamma` is the learner's. They may use the truth, which the policy does not
-    see. Without a road nothing collides, and the potentials are 0.
+    see. Without a road nothing collides, and the potentials are 0. The potential behind an end is 0: that of a horizon that truncates
+    stays, as the learner estimates what lies behind it (Grzes 2017).
     """
 
     reward: str = param("min_gap", "payment of a step: collision, min_gap, error, peak, stealth or final")
@@ -137,6 +138,10 @@ class Reward:
     gap_shaping: NonNegative = param(0.5, "weight of the closeness of the car ahead as a potential [-]")
     error_shaping: NonNegative = param(1.0, "weight of the believed extra gap, per 10 m and capped at 20 m, as a potential [-]")
     gamma: Discount = param(0.995, "discount in the potential's difference [-]")
+    horizon_ends: bool = param(
+        False, "the horizon terminates an episode and the potential behind it is 0, for a learner that expects nothing there; else it truncates",
+        if_any=True,
+    )  # fmt: skip
     illegal_penalty: NonNegative = param(0.0, "cost of a decision whose command is refused in every step [-]")
     attack_cost: NonNegative = param(0.0, "cost of a step under attack: what makes waiting for the right moment pay [-]")
 
@@ -165,7 +170,8 @@ class Reward:
     def __call__(self, model: Model, frame: Frame, fall: Array, last: Array, rise: Array | float = 0.0) -> Array:
         """Return the reward (B,) of one step of the loop; last (B,) bool: the horizon's last step.
 
-        fall (B,) of the smallest gap [m]; rise (B,) of the largest error, which only `peak` asks for.
+        The frame has the first collision of the episode alone. fall (B,) of the smallest gap [m]; rise (B,) of the largest error, which only
+        `peak` asks for.
         """
         out = -self.attack_cost * (frame.command.kind != Kind.NONE)
         for term in self.payment.terms(Step(model, frame, fall, rise, last), self.error_scale):
@@ -173,7 +179,10 @@ class Reward:
         return np.asarray(out)
 
     def decided(self, raw: Array, illegal: Array, before: Array, after: Array, terminated: Array) -> Array:
-        """Return the reward (B,) of a decision from its steps' rewards, if it was illegal, and the potentials (B,) before and after it."""
+        """Return the reward (B,) of a decision.
+
+        raw (B,): of its steps. illegal (B,) bool. before, after (B,): the potentials. terminated (B,) bool: it ended the episode for good.
+        """
         return np.asarray(raw - self.illegal_penalty * illegal + self.gamma * np.where(terminated, 0.0, after) - before)
 
 

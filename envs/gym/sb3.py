@@ -18,9 +18,9 @@ from tailgate.envs.gym.gymnasium_env import AdversaryEnv, AdversaryVectorEnv
 
 
 class BatchVecEnv(VecEnv):
-    """One batch as a VecEnv: same-step autoreset, infos filled at episode ends only (with `episode`, as Monitor writes it).
+    """One batch as a VecEnv: same-step autoreset, infos filled at episode ends only.
 
-    An info that is filled has the names that a single environment's info has. id: whose defaults hold for what `arguments` leaves open.
+    `episode` has return and length as Monitor writes them, and whether there was a collision (`crashed`). An info that is filled has the names that a single environment's info has. id: whose defaults hold for what `arguments` leaves open.
     """
 
     def __init__(self, num_envs: int, id: str = CAR_FOLLOWING, **arguments: Any) -> None:
@@ -29,14 +29,14 @@ class BatchVecEnv(VecEnv):
         self.batch = AdversaryVectorEnv(num_envs, autoreset="same_step", **(FACES[id] | arguments))
         super().__init__(num_envs, self.batch.single_observation_space, self.batch.single_action_space)
         self._actions: Array = np.zeros(0)
-        self._returns, self._lengths = np.zeros(num_envs), np.zeros(num_envs, np.int64)
+        self._returns, self._lengths, self._crashed = np.zeros(num_envs), np.zeros(num_envs, np.int64), np.zeros(num_envs, bool)
 
     def reset(self) -> Array:
         options = self._options[0] or None
         self._reset_options()
         observation, _ = self.batch.reset(seed=self._seeds[0], options=options)  # row i: this seed + i, as `seed` sets them
         self._reset_seeds()
-        self._returns[:], self._lengths[:] = 0.0, 0
+        self._returns[:], self._lengths[:], self._crashed[:] = 0.0, 0, False
         return observation
 
     def step_async(self, actions: Array) -> None:
@@ -47,15 +47,16 @@ class BatchVecEnv(VecEnv):
         done = terminated | truncated
         self._returns += reward
         self._lengths += 1
+        self._crashed |= info["collided"] | info["rear_collided"]
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if done.any():
             final, told = info["final_obs"], info["final_info"]
             for i in np.flatnonzero(done):
                 infos[i] = AdversaryEnv.row(told, int(i)) | {
                     "terminal_observation": final[i].copy(), "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
-                    "episode": {"r": float(self._returns[i]), "l": int(self._lengths[i])},
+                    "episode": {"r": float(self._returns[i]), "l": int(self._lengths[i]), "crashed": bool(self._crashed[i])},
                 }  # fmt: skip
-            self._returns[done], self._lengths[done] = 0.0, 0
+            self._returns[done], self._lengths[done], self._crashed[done] = 0.0, 0, False
         return observation, reward.astype(np.float32), done, infos
 
     def close(self) -> None:

@@ -44,7 +44,7 @@ def earned(environment, attack):
 def line(name, environment, seconds):
     """Decisions, processor seconds and the return of one training."""
     module = learner_of(name)
-    learner = module.Learner(0, 0.995, module.Config(), environment, None)
+    learner = module.Learner(0, 0.995, module.Config(), environment | {"horizon_ends": True}, None)
     begun = time.process_time()
 
     def report(now):

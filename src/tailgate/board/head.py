@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -78,7 +79,9 @@ def _line(lines: Iterable[Board], dose: str) -> Board | None:
 def _pointwise(entry: Board, dose: str) -> str:
     line = _line(entry.get("pointwise", ()), dose)
     held = line["undamaged"] if line else None
-    return "-" if held is None else f"{100 * held['value']:.0f} % ({100 * held['low']:.0f} to {100 * held['high']:.0f})"
+    if held is None:
+        return "-"
+    return f"{100 * held['value']:.0f} % ({at_least(held['low']).rstrip('%')} to {math.ceil(100 * held['high'] - 1e-9)})"
 
 
 def _under_attack(entry: Board, dose: str) -> list[str]:

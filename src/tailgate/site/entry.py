@@ -92,8 +92,9 @@ def _rates(suite: Suite, entry: Entry) -> list[Data]:
 
 
 def _worst(suite: Suite, entry: Entry) -> list[Data]:
-    """Return the cell of the attack that did most damage per scenario and shown dose; computed optima do not count."""
-    mine = [c for c in suite.board.cells_of(entry.defence) if not c.optimal and c.attack != "none"]
+    """Return the cell of the attack that did most damage per scenario and shown dose. Computed optima and withdrawn attacks do not count."""
+    idle = {"none", *(a.attack for a in suite.board.attacks if a.withdrawn)}
+    mine = [c for c in suite.board.cells_of(entry.defence) if not c.optimal and c.attack not in idle]
     out = []
     for scenario in suite.board.suite.scenarios:
         for dose in suite.shown:

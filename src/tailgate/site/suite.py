@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from tailgate.board.order import sort_dose
 from tailgate.board.schema import LEVELS, Board, CellLine, Data, Dose, Entry, Interval, Level, Limited
 from tailgate.board.words import Name, at_least, names_of, percent, shade
+from tailgate.core.scenario import list_scenarios, load_scenario
 
 from .charts import Axis
 
@@ -83,7 +84,9 @@ class Suite:
             return f"an error above {figure(bound)}"
         share = self.board.suite.progress
         less = "" if share is None else f", or less than {percent(share)} of the distance without an attack"
-        return f"a collision, in front or behind{less}"
+        names = [scenario.name for scenario in self.board.suite.scenarios]
+        in_lane = all(name in list_scenarios() and load_scenario(name).brief().model.lane for name in names)
+        return f"{'the lane is left' if in_lane else 'a collision, in front or behind'}{less}"
 
     @property
     def places(self) -> list[float]:

@@ -92,7 +92,7 @@ def _config(who: Trained) -> train.TrainConfig:
     if not isinstance(held, dict) or who.seed is None:
         raise InputError(where, record.get("seed"), "the configuration and the seed of a training")
     scenario_of(who)
-    config = train.checked({key: value for key, value in held.items() if key != "class"})
+    config = train.recorded(held)
     spec = Spec("defence", config.defence)
     recorded = str(record.get("defence_digest", "")), record.get("defence_version", 1)
     if recorded != (spec.digest, spec.entry.version):

@@ -36,11 +36,11 @@ from tailgate.training.settings import check_mappings, check_name, check_places,
 from tailgate.training.trainings import Training, train_all
 
 BARE = "quickstart"  # the preset where none is named
-ENVIRONMENT = (fields_of(ActionSpec) | fields_of(Reward) | {"frames": None}).keys() - {"gamma"}  # that `environment` may hold
+ENVIRONMENT = (fields_of(ActionSpec) | fields_of(Reward) | {"frames": None}).keys() - {"gamma", "horizon_ends"}  # that `environment` may hold
 # fields that change no policy; those of CHOSEN do where the best rival teaches
 COMPARED = {"episodes", "first_episode", "white_box", "others", "workers", "device"}
 CHOSEN = {"rivals", "select_episodes", "outcome"}
-LATER = {"demonstrations"}  # fields that joined when policies had been published: at its default such a field leaves no mark
+LATER = {"demonstrations", "horizon_ends"}  # fields that joined when policies had been published: at its default such a field leaves no mark
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,7 @@ class TrainConfig:
     teacher: str | None = param(None, "script that PPO imitates before it learns: one by name, or `best` of the rivals; none: from scratch")
     demonstrations: Episodes = param(1024, "episodes of its teacher that a learner is shown")
     gamma: Discount = param(0.995, "discount, of the learner and of the shaping [-]")
+    horizon_ends: bool = param(True, "nothing is expected behind the horizon, which the observation shows coming; false: as before 0.3")
     steps: Steps = param(3_000_000, "decisions per training seed, over all environments")
     first_seed: Count = param(0, "first training seed")
     seeds: Seeds = param(1, "training seeds, one policy each")
@@ -140,6 +141,11 @@ def checked(data: dict[str, Any]) -> TrainConfig:
     return config
 
 
+def recorded(data: dict[str, Any]) -> TrainConfig:
+    """Return the configuration that the record of a policy holds. Records without `horizon_ends` are of trainings that had none."""
+    return checked({"horizon_ends": False} | {key: value for key, value in data.items() if key != "class"})
+
+
 def _places(learner: object) -> dict[str, Iterable[str]]:
     """Return the fields below each field: those of the learner in use, then those of the other ones that are installed."""
     places: dict[str, Iterable[str]] = {}
@@ -154,7 +160,8 @@ def environment_of(config: TrainConfig) -> dict[str, Any]:
     for key in config.environment:
         if key not in ENVIRONMENT:  # the scenario, the defence, the threat model and gamma have other fields
             raise unknown("config.environment: unknown field", key, ENVIRONMENT)
-    return {"scenario": config.scenario, "defence": config.defence, "threat": dict(config.threat), **config.environment}
+    place = {"scenario": config.scenario, "defence": config.defence, "threat": dict(config.threat)}
+    return place | config.environment | {"horizon_ends": config.horizon_ends}
 
 
 def outcome_of(config: TrainConfig) -> str:
