@@ -3,6 +3,7 @@
 import copy
 import hashlib
 import json
+import lzma
 import math
 import re
 from pathlib import Path
@@ -14,7 +15,7 @@ from tailgate.board.files import read_board
 from tailgate.board.words import at_least, percent
 from tailgate.site.build import build_site
 from tailgate.site.cards import LICENCE
-from tailgate.site.entry import _imported, replay_of
+from tailgate.site.entry import _imported, _worst, replay_of
 from tailgate.site.suite import Suite, critical_of
 
 from . import boards
@@ -380,3 +381,20 @@ def test_where_nobody_did_damage_no_attack_is_called_the_worst() -> None:
     by_name = {e.defence: critical_of(suite, e, "black") for e in suite.board.entries}
     assert by_name["safe_state_brake"]["worst"] == "" and "no attack that knows at most this did damage" in by_name["safe_state_brake"]["about"]
     assert "chi2_kf_sparse-ppo-black" in by_name["chi2_kf_sparse"]["worst"] and "did damage" not in by_name["chi2_kf_sparse"]["about"]
+
+
+def test_the_worst_of_a_cell_is_an_attack_that_counts() -> None:
+    """One that was taken back by an erratum is not shown as the worst, however much it damaged."""
+    suite = Suite(read_board(make_board()), "synthetic-v0")
+    name = suite.board.entries[0]
+    first = {line["cell"].attack for line in _worst(suite, name)}
+    assert first
+    for attack in suite.board.attacks:
+        attack.withdrawn = attack.attack in first
+    assert not first & {line["cell"].attack for line in _worst(suite, name)}
+
+
+def test_damage_in_a_lane_is_leaving_it() -> None:
+    board = read_board(json.loads(lzma.decompress((ROOT / "results/lane-v0/board.json.xz").read_bytes())))
+    assert Suite(board, "lane-v0").damage == "the lane is left"
+    assert Suite(read_board(make_board()), "synthetic-v0").damage == "a collision, in front or behind"

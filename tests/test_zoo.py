@@ -77,9 +77,9 @@ def test_the_recorded_outcome_is_what_the_policy_does(group: str) -> None:
     rows = evaluate(
         scenarios=[who.scenario], defences=[who.defence], attacks=[text, "none"], doses=[None], seeds=measured["episodes"], threat=who.threat,
     )  # fmt: skip
-    for attack, recorded in ((text, measured), ("none", measured["no_attack"])):
+    for attack, told in ((text, measured), ("none", measured["no_attack"])):
         mine = [row[measured["outcome"]] for row in rows if row["attack"] == attack]
-        assert sum(mine) / len(mine) == pytest.approx(recorded["value"], rel=1e-12, abs=1e-12), attack
+        assert sum(mine) / len(mine) == pytest.approx(told["value"], rel=1e-12, abs=1e-12), attack
 
 
 def test_a_copy_with_single_precision_plays_bit_for_bit(tmp_path: Path) -> None:

@@ -176,7 +176,8 @@ class StableLearner:
         arrays: dict[str, Any] = {
             **{f"batch.{name}": value for name, value in batch.episodes.held().items()},
             "env.returns": self.env._returns, "env.lengths": self.env._lengths, "env.crashed": self.env._crashed,
-            "last_obs": model._last_obs, "last_starts": model._last_episode_starts, "numpy": words, **{f"held.{name}": value for name, value in self.held().items()},
+            "last_obs": model._last_obs, "last_starts": model._last_episode_starts, "numpy": words,
+            **{f"held.{name}": value for name, value in self.held().items()},
         }  # fmt: skip
         for name, array in arrays.items():
             whole = np.array(array, order="C")  # torch has no unsigned integers of 32 and 64 bits: keep their bits

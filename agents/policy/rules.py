@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 
 from tailgate.agents.policy.network_policy import PolicyAttack, PolicyPlan, Seen
 from tailgate.base.errors import InputError, unknown
-from tailgate.base.files import write_atomic
+from tailgate.base.files import write_json
 from tailgate.base.reading import load_json
 from tailgate.core import Array, param
 from tailgate.core.registry import register
@@ -80,7 +79,7 @@ def save_rules(path: Path, root: Split | Leaf, actions: tuple[str, ...], header:
     """Write rules as JSON; `header` holds the fields of `Seen`. Return the file."""
     data = {"format": FORMAT} | as_data(header) | {"actions": list(actions), "tree": _as_data(root, header["observation"], actions)}
     path = path.with_suffix(".json")
-    write_atomic(path, json.dumps(data, indent=1).encode() + b"\n")
+    write_json(path, data)
     return path
 
 

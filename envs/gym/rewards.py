@@ -139,9 +139,8 @@ class Reward:
     error_shaping: NonNegative = param(1.0, "weight of the believed extra gap, per 10 m and capped at 20 m, as a potential [-]")
     gamma: Discount = param(0.995, "discount in the potential's difference [-]")
     horizon_ends: bool = param(
-        False, "the horizon terminates an episode and the potential behind it is 0, for a learner that expects nothing there; else it truncates",
-        if_any=True,
-    )  # fmt: skip
+        False, "the horizon terminates an episode, with a potential of 0 behind it; else it truncates", if_any=True
+    )
     illegal_penalty: NonNegative = param(0.0, "cost of a decision whose command is refused in every step [-]")
     attack_cost: NonNegative = param(0.0, "cost of a step under attack: what makes waiting for the right moment pay [-]")
 
@@ -170,8 +169,8 @@ class Reward:
     def __call__(self, model: Model, frame: Frame, fall: Array, last: Array, rise: Array | float = 0.0) -> Array:
         """Return the reward (B,) of one step of the loop; last (B,) bool: the horizon's last step.
 
-        The frame has the first collision of the episode alone. fall (B,) of the smallest gap [m]; rise (B,) of the largest error, which only
-        `peak` asks for.
+        The frame has the first collision of the episode alone. fall (B,) of the smallest gap [m]; rise (B,) of the largest error, which
+        only `peak` asks for.
         """
         out = -self.attack_cost * (frame.command.kind != Kind.NONE)
         for term in self.payment.terms(Step(model, frame, fall, rise, last), self.error_scale):

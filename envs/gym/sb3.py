@@ -20,7 +20,8 @@ from tailgate.envs.gym.gymnasium_env import AdversaryEnv, AdversaryVectorEnv
 class BatchVecEnv(VecEnv):
     """One batch as a VecEnv: same-step autoreset, infos filled at episode ends only.
 
-    `episode` has return and length as Monitor writes them, and whether there was a collision (`crashed`). An info that is filled has the names that a single environment's info has. id: whose defaults hold for what `arguments` leaves open.
+    `episode` has return and length as Monitor writes them, and whether there was a collision (`crashed`). An info that is filled has the
+    names that a single environment's info has. id: whose defaults hold for what `arguments` leaves open.
     """
 
     def __init__(self, num_envs: int, id: str = CAR_FOLLOWING, **arguments: Any) -> None:

@@ -8,6 +8,7 @@ A killed writer leaves the old file and a temporary one, which `sweep` removes.
 import contextlib
 import glob
 import itertools
+import json
 import os
 import tempfile
 from collections.abc import Callable, Iterator
@@ -82,6 +83,11 @@ def write_atomic(path: Path, content: bytes, field: str = "out") -> None:
     """Write a file in one step: readers see the old content or the new one. Raise InputError if it cannot be written."""
     with replacing(path, field) as file:
         file.write(content)
+
+
+def write_json(path: Path, data: object, field: str = "out") -> None:
+    """Write data as JSON, as `write_atomic` writes. Raise ValueError for NaN and infinity, which JSON does not have."""
+    write_atomic(path, json.dumps(data, indent=1, allow_nan=False).encode() + b"\n", field)
 
 
 def sweep(path: Path) -> None:

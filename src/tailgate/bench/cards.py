@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import json
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -13,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tailgate.base.errors import unknown
-from tailgate.base.files import writable_directory, write_atomic
+from tailgate.base.files import writable_directory, write_json
 from tailgate.base.provenance import commit
 from tailgate.base.version import VERSION
 from tailgate.core import draws
@@ -212,5 +211,5 @@ def print_record(record: dict[str, Any], table: Callable[..., None]) -> None:
 def write(record: dict[str, Any], folder: Path) -> Path:
     """Write the record; return its file."""
     path = writable_directory(folder) / FILE
-    write_atomic(path, json.dumps(record, indent=1, allow_nan=False).encode() + b"\n")
+    write_json(path, record)
     return path

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from tailgate.base.errors import InputError
-from tailgate.base.files import writable_directory, write_atomic
+from tailgate.base.files import writable_directory, write_atomic, write_json
 from tailgate.base.reading import load_json
 
 from .lines import BYTES, NUMBER, RATE, SECONDS, SHARE
@@ -210,5 +209,5 @@ def write(record: Record, directory: Path) -> tuple[list[Path], str | None]:
         plots.append(plot_name(plot))
         paths.append(directory / plot_name(plot))
     write_atomic(directory / PAGE, page(record, plots).encode())
-    write_atomic(directory / RECORD, json.dumps(record, indent=1, allow_nan=False).encode() + b"\n")
+    write_json(directory / RECORD, record)
     return [directory / RECORD, directory / PAGE, *paths], why

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-import json
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from tailgate.base.errors import InputError, wanted
-from tailgate.base.files import writable_directory, write_atomic
+from tailgate.base.files import writable_directory, write_atomic, write_json
 from tailgate.base.locks import alone
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite
@@ -71,7 +70,7 @@ def search(
         "defence": spec.target, "digest": spec.digest, "version": spec.entry.version, "ensemble": NAME, "budget": plan.ensemble,
         "seed": seed_of(beacon), "cells": [_cell(result, out / "found") for result in results],
     }  # fmt: skip
-    write_atomic(out / f"{stem(defence)}{ENDING}", json.dumps(line, indent=1).encode() + b"\n")
+    write_json(out / f"{stem(defence)}{ENDING}", line)
     return line
 
 

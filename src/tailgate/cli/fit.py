@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -43,7 +42,7 @@ def _trace(text: str) -> tuple[str, float]:
 
 
 def _fit(options: argparse.Namespace) -> int:
-    from tailgate.base.files import write_atomic
+    from tailgate.base.files import write_atomic, write_json
     from tailgate.roads.fit import DELAYS, Settings, draw, fit
 
     plot = picture("--plot", options.plot) if options.plot else None
@@ -52,7 +51,7 @@ def _fit(options: argparse.Namespace) -> int:
     with working() as update:
         held = fit(settings, counted(update, "fitting", "fits"))
     if options.out:
-        write_atomic(Path(options.out), json.dumps(held, indent=1).encode() + b"\n")
+        write_json(Path(options.out), held)
     if plot is not None:
         write_atomic(plot, draw(held, form=plot.suffix.lower()[1:]), "plot")
     show(options, held, _tables)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +33,7 @@ def add(actions: Commands) -> None:
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from tailgate.base.files import writable_directory, write_atomic
+    from tailgate.base.files import writable_directory, write_json
     from tailgate.board.verified import digest
     from tailgate.evaluation.rows import Row, read_rows
     from tailgate.evaluation.verify import verify
@@ -63,7 +62,7 @@ def _verify(options: argparse.Namespace) -> int:
     for finding in report["findings"]:
         finding["file"], finding["line"] = origin[finding["line"] - 1]
     if options.out is not None:
-        write_atomic(Path(options.out), json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
+        write_json(Path(options.out), report)
     show(options, report, _print)
     return 1 if report["counts"]["differs"] or not report["counts"]["verified"] else 0
 

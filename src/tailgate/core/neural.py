@@ -6,7 +6,6 @@ No sum depends on the batch, and so no trace does. Reading a file executes nothi
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -19,7 +18,7 @@ from safetensors.numpy import save as save_tensors
 
 from tailgate import num
 from tailgate.base.errors import InputError, said
-from tailgate.base.files import write_atomic
+from tailgate.base.files import write_atomic, write_json
 from tailgate.base.reading import TENSORS, load_json, read_bytes, tensors_of
 from tailgate.core.nouns import Array
 from tailgate.core.schema import build
@@ -137,7 +136,7 @@ def write_trained(path: Path, form: str, tensors: Mapping[str, Array], layers: i
     blob, file = save_tensors({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}), path.with_suffix(".safetensors")
     data = {"format": form, "tensors": file.name, "sha256": hashlib.sha256(blob).hexdigest(), "layers": layers}
     write_atomic(file, blob)
-    write_atomic(path.with_suffix(".json"), json.dumps(data | header, indent=1).encode() + b"\n")
+    write_json(path.with_suffix(".json"), data | header)
     return path.with_suffix(".json")
 
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from tailgate.base import sizes, sources
 from tailgate.base.errors import InputError, NotApplicable, said, unknown
-from tailgate.base.files import writable_directory, write_atomic
+from tailgate.base.files import writable_directory, write_atomic, write_json
 from tailgate.base.locks import alone
 from tailgate.base.pool import apart, each
 from tailgate.base.reading import load_json
@@ -162,7 +162,7 @@ def searched(
 
     def finish(number: int, result: dict[str, Any]) -> None:
         done[number] = result
-        write_atomic(_file(jobs[number], folder), json.dumps(result, indent=1).encode() + b"\n")
+        write_json(_file(jobs[number], folder), result)
         _journal(jobs[number], folder).unlink(missing_ok=True)
         best = _best(result)
         show(text=f", {result['scenario']}: {best['damage']:.0%} by {best['attack']}" if best else "")
@@ -291,7 +291,7 @@ def attack(
         "cells": [_compared(result, rows, suite) for result in results],
     }  # fmt: skip
     if out is not None:
-        write_atomic(out / "attack.json", json.dumps(report, indent=1).encode() + b"\n")
+        write_json(out / "attack.json", report)
     return report
 
 

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import json
 import platform
 import sys
 from collections.abc import Iterator, Sequence
@@ -31,7 +30,7 @@ import numpy as np
 from rich.console import Console
 
 from tailgate.base.errors import InputError, NotApplicable, said, unknown
-from tailgate.base.files import write_atomic
+from tailgate.base.files import write_json
 from tailgate.base.progress import progress
 from tailgate.base.reading import load_json
 from tailgate.core import draws
@@ -279,7 +278,7 @@ def _write(only: list[str] | None) -> int:
     held = {
         "format": FORMAT, "platform": this_platform(), "episodes": EPISODES, "purpose": PURPOSE, "suites": suites, "scenarios": scenarios,
     }  # fmt: skip
-    write_atomic(FILE, json.dumps(held, indent=1).encode() + b"\n", "golden")
+    write_json(FILE, held, "golden")
     print(FILE)
     return 0
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ import numpy as np
 
 from tailgate.base import sources
 from tailgate.base.errors import InputError
-from tailgate.base.files import writable_directory, write_atomic
+from tailgate.base.files import writable_directory, write_json
 from tailgate.base.locks import alone
 from tailgate.base.reading import load_json
 from tailgate.core.draws import Role
@@ -163,7 +162,7 @@ def _noise(job: Rare, play: NoisyLoop, out: Path | None, update: Progress) -> di
 
 def _keep(path: Path | None, data: dict[str, Any]) -> None:
     if path is not None:
-        write_atomic(path, json.dumps(data, indent=1, allow_nan=False).encode() + b"\n")
+        write_json(path, data)
 
 
 def _kept(path: Path | None, name: str) -> dict[str, Any] | None:

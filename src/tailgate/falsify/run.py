@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tailgate.base.files import writable_directory, write_atomic
+from tailgate.base.files import writable_directory, write_json
 from tailgate.base.locks import alone
 from tailgate.falsify.counterexample import counterexample
 from tailgate.falsify.search import Search, search
@@ -57,6 +56,6 @@ def falsify(job: Search, out: Path | None = None, progress: Progress | None = No
         }  # fmt: skip
         if out is not None:
             if report["violated"]:
-                write_atomic(out / COUNTEREXAMPLE, json.dumps(found, indent=1, allow_nan=False).encode() + b"\n")
-            write_atomic(out / REPORT, json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
+                write_json(out / COUNTEREXAMPLE, found)
+            write_json(out / REPORT, report)
     return report

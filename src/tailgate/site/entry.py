@@ -92,7 +92,7 @@ def _rates(suite: Suite, entry: Entry) -> list[Data]:
 
 
 def _worst(suite: Suite, entry: Entry) -> list[Data]:
-    """Return the cell of the attack that did most damage per scenario and shown dose. Computed optima and withdrawn attacks do not count."""
+    """Return the cell of the attack that did most damage per scenario and shown dose, without computed optima and withdrawn attacks."""
     idle = {"none", *(a.attack for a in suite.board.attacks if a.withdrawn)}
     mine = [c for c in suite.board.cells_of(entry.defence) if not c.optimal and c.attack not in idle]
     out = []

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -21,7 +20,7 @@ import numpy as np
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, NotApplicable
-from tailgate.base.files import replacing, sweep, writable_directory, write_atomic
+from tailgate.base.files import replacing, sweep, writable_directory, write_atomic, write_json
 from tailgate.base.locks import alone
 from tailgate.base.pytree import duplicate
 from tailgate.base.reading import load_json
@@ -172,7 +171,7 @@ def _written(
         },
     }  # fmt: skip
     write_atomic(folder / "README.md", readme(held).encode())
-    write_atomic(folder / "schema.json", json.dumps(held, indent=1, allow_nan=False).encode() + b"\n")
+    write_json(folder / "schema.json", held)
     return held
 
 

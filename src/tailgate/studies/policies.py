@@ -228,13 +228,11 @@ def label(text: str, width: int = 30) -> str:
 
 def write_report(directory: Path, name: str, report: dict[str, Any], picture: bytes | None, form: str = "png") -> list[Path]:
     """Write NAME.json and the picture NAME.png, or that of another form; returns their paths."""
-    import json
-
-    from tailgate.base.files import writable_directory, write_atomic
+    from tailgate.base.files import writable_directory, write_atomic, write_json
 
     writable_directory(directory)
     out = [directory / f"{name}.json"]
-    write_atomic(out[0], json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
+    write_json(out[0], report)
     if picture is not None:
         out.append(directory / f"{name}.{form}")
         write_atomic(out[1], picture)

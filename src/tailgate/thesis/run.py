@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import dataclasses
-import json
 import re
 from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
@@ -16,7 +15,7 @@ from markupsafe import Markup, escape
 from tailgate.base import sizes
 from tailgate.base.assets import templates
 from tailgate.base.errors import InputError, unknown
-from tailgate.base.files import writable_directory, write_atomic
+from tailgate.base.files import writable_directory, write_atomic, write_json
 from tailgate.base.reading import load_json
 from tailgate.base.version import VERSION
 
@@ -145,7 +144,7 @@ def write(report: Report, directory: Path, **stamp: object) -> Path:
     write_atomic(directory / "report.md", markdown(report).encode())
     written = directory / "index.html"
     write_atomic(written, html(report).encode())
-    write_atomic(directory / "report.json", json.dumps(data, indent=1, allow_nan=False).encode() + b"\n")  # last: what was cut off has none
+    write_json(directory / "report.json", data)  # last: what was cut off has none
     return written
 
 

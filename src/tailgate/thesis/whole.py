@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from typing import Any
 
 from tailgate.base import sources
 from tailgate.base.errors import InputError
-from tailgate.base.files import sweep, writable_directory, write_atomic
+from tailgate.base.files import sweep, writable_directory, write_atomic, write_json
 from tailgate.base.locks import alone
 from tailgate.base.reading import load_json
 from tailgate.base.version import VERSION
@@ -176,7 +175,7 @@ def write_whole(whole: Whole, directory: Path) -> Path:
     drawn = {f"{r.chapter}-{f.name}" for r in whole.reports for f in r.figures}
     if missing := {name for item in whole.coverage for name in item.figures} - drawn:
         raise InputError("coverage: figures", sorted(missing), "figures that a chapter draws")
-    write_atomic(directory / "report.json", json.dumps(as_data(whole), indent=1, allow_nan=False).encode() + b"\n")
+    write_json(directory / "report.json", as_data(whole))
     write_atomic(directory / "report.md", markdown(whole).encode())
     write_atomic(directory / "index.html", html(whole).encode())
     sweep(directory)

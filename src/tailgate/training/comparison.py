@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tailgate.agents.policy.network_policy import load_policy
-from tailgate.base.files import write_atomic
+from tailgate.base.files import write_json
 from tailgate.base.reading import load_json
 from tailgate.core import Array, draws
 from tailgate.core.registry import Spec
@@ -145,7 +145,7 @@ def _report(
         },
         "left_out": left_out,
     }  # fmt: skip
-    write_atomic(config.directory / "report.json", json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
+    write_json(config.directory / "report.json", report)
     return report
 
 

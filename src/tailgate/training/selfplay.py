@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -32,7 +31,7 @@ from tailgate.agents.learners.learning import LEARNERS, Progress, learner_of
 from tailgate.agents.learners.selfplay import Learner, Played, constant, export, play
 from tailgate.agents.policy.network_policy import PolicyAttack
 from tailgate.base.errors import InputError, said
-from tailgate.base.files import set_aside, writable_directory, write_atomic
+from tailgate.base.files import set_aside, writable_directory, write_json
 from tailgate.base.locks import alone
 from tailgate.base.reading import load_json
 from tailgate.base.sizes import Episodes, Passes, Seeds, Steps
@@ -156,7 +155,7 @@ class Game:
             changed = [key for key in now if key not in free and before.get(key) != now[key]]
             if changed:
                 raise InputError("resume", ", ".join(changed), f"the configuration in {held}, apart from {', '.join(free[1:])}")
-        write_atomic(held, json.dumps(now, indent=1).encode() + b"\n")
+        write_json(held, now)
 
     # -- training
 
@@ -299,7 +298,7 @@ class Game:
             "self_play_attacker": last, "table": table, "exploitability": exploitability, "worst": worst,
             "worst_fixed_minus_trained": saved._asdict(),
         }  # fmt: skip
-        write_atomic(self.directory / "report.json", json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
+        write_json(self.directory / "report.json", report)
         return report
 
 

@@ -16,7 +16,7 @@ from tailgate.agents.learners.finished import finished
 from tailgate.agents.learners.learning import DISCRETE, LEARNERS, Config, Progress, Teachable, check_action, learner_of
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, said, unknown
-from tailgate.base.files import set_aside, writable_directory, write_atomic
+from tailgate.base.files import set_aside, writable_directory, write_json
 from tailgate.base.locks import alone
 from tailgate.base.reading import load_json
 from tailgate.base.sizes import Episodes, Seeds, Steps, Workers
@@ -36,11 +36,11 @@ from tailgate.training.settings import check_mappings, check_name, check_places,
 from tailgate.training.trainings import Training, train_all
 
 BARE = "quickstart"  # the preset where none is named
-ENVIRONMENT = (fields_of(ActionSpec) | fields_of(Reward) | {"frames": None}).keys() - {"gamma", "horizon_ends"}  # that `environment` may hold
+ENVIRONMENT = (fields_of(ActionSpec) | fields_of(Reward) | {"frames": None}).keys() - {"gamma", "horizon_ends"}  # that it may hold
 # fields that change no policy; those of CHOSEN do where the best rival teaches
 COMPARED = {"episodes", "first_episode", "white_box", "others", "workers", "device"}
 CHOSEN = {"rivals", "select_episodes", "outcome"}
-LATER = {"demonstrations", "horizon_ends"}  # fields that joined when policies had been published: at its default such a field leaves no mark
+LATER = {"demonstrations", "horizon_ends"}  # fields that joined when policies had been published: they leave no mark at their defaults
 
 
 @dataclass(frozen=True)
@@ -311,7 +311,7 @@ def _begin(config: TrainConfig, resume: bool) -> None:
         set_aside(config.directory)
     writable_directory(config.directory)
     if not _is_held(config, _told(config)):
-        write_atomic(_told(config), json.dumps(as_data(config), indent=1).encode() + b"\n")
+        write_json(_told(config), as_data(config))
 
 
 def _told(config: TrainConfig) -> Path:

@@ -32,7 +32,7 @@ from tailgate.agents.learners.learning import Progress, learner_of
 from tailgate.agents.policy.network_policy import PolicyAttack
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, said, unknown
-from tailgate.base.files import writable_directory, write_atomic
+from tailgate.base.files import writable_directory, write_atomic, write_json
 from tailgate.base.locks import alone
 from tailgate.base.pool import apart, each
 from tailgate.base.reading import lines_of, parse_json
@@ -348,5 +348,5 @@ def _report(search: Search, study: Study) -> dict[str, Any]:
         path = search.directory / "best.yaml"
         write_atomic(path, yaml.safe_dump(kept, sort_keys=False).encode())
         report["config"] = str(path)
-    write_atomic(search.directory / "trials.json", json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
+    write_json(search.directory / "trials.json", report)
     return report

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
 import shlex
 from collections.abc import Callable, Generator, Mapping, Sequence
 from functools import partial
@@ -18,7 +17,7 @@ from typing import Any
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
-from tailgate.base.files import remove, set_aside, sweep, writable_directory, write_atomic
+from tailgate.base.files import remove, set_aside, sweep, writable_directory, write_atomic, write_json
 from tailgate.base.locks import alone
 from tailgate.base.pool import apart, each
 from tailgate.base.reading import lines_of, parse_json
@@ -148,7 +147,7 @@ def check(
         found = report(rows[: len(jobs)], suite, alpha=alpha, settings=settings, clean=rows[len(jobs) :])
         if folder is not None:
             _keep_failures(found, jobs, folder)
-            write_atomic(folder / REPORT, json.dumps(found, indent=1, allow_nan=False).encode() + b"\n")
+            write_json(folder / REPORT, found)
     return found
 
 
