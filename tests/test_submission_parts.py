@@ -164,7 +164,7 @@ def test_sandboxes_have_no_network_and_can_write_to_one_file_only(tmp_path: Path
     for name in ("in", "out"):
         (tmp_path / name).touch()
     limits, source = Limits(memory=2**30, processes=4), tmp_path / "source"
-    line = bwrap(tmp_path, source, limits)
+    line = bwrap(tmp_path, source, limits, tmp_path / "objects")
     assert line[0] == "bwrap" and line[-1] == "--" and "--unshare-all" in line and "--share-net" not in line and "--die-with-parent" in line
     writable = [line[i + 2] for i, word in enumerate(line) if word == "--bind"]
     assert str(tmp_path / "out") in writable and all(path.endswith(("/out", "/__pycache__")) for path in writable)

@@ -16,7 +16,7 @@ from functools import partial
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from tailgate.base import sizes, sources
+from tailgate.base import own_modules, sizes, sources
 from tailgate.base.errors import InputError, said
 from tailgate.base.pool import Answer, answer, done, hired
 
@@ -144,7 +144,7 @@ def on_ray(address: str | None = None, workers: int = 1) -> Iterator[None]:
     try:
         ray.init(
             address or "local", include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR, **size,
-            runtime_env={"env_vars": {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}},
+            runtime_env={"env_vars": {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, [*sys.path, *own_modules.folders()]))}},
         )  # fmt: skip
     except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
         raise InputError("--address", address, f"a Ray cluster that answers ({said(error).strip().splitlines()[0]})") from error

@@ -21,7 +21,7 @@ class InputError(ValueError):
     def __init__(self, field: str, value: object, expected: str) -> None:
         shown = " ".join(repr(value).split())
         shown = _cut(shown, 120)
-        super().__init__(_line(f"{_cut(field, 300)}: got {shown}; expected {_cut(expected, 1500)}"))
+        super().__init__(one_line(f"{_cut(field, 300)}: got {shown}; expected {_cut(expected, 1500)}"))
         self.field, self.value, self.expected = field, value, expected
 
     def __reduce__(self) -> tuple[type, tuple[str, object, str]]:
@@ -66,7 +66,7 @@ def _cut(text: str, most: int) -> str:
     return text if len(text) <= most else text[: most - 3] + "..."
 
 
-def _line(text: str) -> str:
+def one_line(text: str) -> str:
     """Return the text in one line, with control characters written out, safe for a terminal."""
     return text if text.isprintable() else "".join(ch if ch.isprintable() else " " if ch.isspace() else repr(ch)[1:-1] for ch in text)
 

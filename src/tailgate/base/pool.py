@@ -22,7 +22,7 @@ from contextvars import ContextVar
 from multiprocessing import connection, resource_tracker
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
-from tailgate.base import sizes
+from tailgate.base import own_modules, sizes
 from tailgate.base.errors import Killed
 
 R = TypeVar("R")
@@ -77,11 +77,13 @@ class _Worker:
         self.pipe, theirs = multiprocessing.Pipe()
         self.job: int | None = None
         # a daemon, so that an idle worker does not delay the parent's exit
-        self.process = multiprocessing.get_context("spawn").Process(target=_serve, args=(theirs, list(sys.path)), daemon=True)
+        self.process = multiprocessing.get_context("spawn").Process(
+            target=_serve, args=(theirs, list(sys.path), bool(own_modules.folders())), daemon=True
+        )
         resource_tracker.ensure_running()  # started later, it would unblock the signals
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # inherited: a terminal's interrupt reaches the parent only
         try:
-            with _single():
+            with _environment():
                 self.process.start()
         finally:
             theirs.close()
@@ -97,16 +99,19 @@ class _Worker:
 
 
 @contextlib.contextmanager
-def _single() -> Iterator[None]:
-    """Let processes that start here multiply matrices in one thread, unless the user says how many: workers would wait for each other."""
-    if any(name in os.environ for name in THREADS):
-        yield
-        return
-    os.environ[THREADS[0]] = "1"
+def _environment() -> Iterator[None]:
+    """Let processes that start here import nothing from the working directory by themselves, and multiply matrices in one thread.
+
+    The user may say how many threads: with more, workers would wait for each other.
+    """
+    changes = {"PYTHONSAFEPATH": "1"} | ({} if any(name in os.environ for name in THREADS) else {THREADS[0]: "1"})
+    before = {name: os.environ.get(name) for name in changes}
+    os.environ.update(changes)
     try:
         yield
     finally:
-        os.environ.pop(THREADS[0], None)
+        for name, value in before.items():
+            os.environ.pop(name, None) if value is None else os.environ.update({name: value})
 
 
 class Crew:
@@ -245,12 +250,14 @@ def say(value: object) -> None:
         _line.send(("said", value))
 
 
-def _serve(pipe: connection.Connection, path: list[str]) -> None:
-    """Run jobs one after another until the parent closes the pipe."""
+def _serve(pipe: connection.Connection, path: list[str], own: bool) -> None:
+    """Run jobs one after another until the parent closes the pipe. own: the user's modules may lie in the working directory."""
     global _line
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
-    sys.path[:] = path  # the worker finds a submission's module where the parent found it
+    sys.path[:] = path  # the worker finds a module where the parent found it
+    if own:
+        own_modules.allow()
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _line = pipe
     with contextlib.suppress(EOFError, ConnectionError):

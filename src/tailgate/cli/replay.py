@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import Any, Literal
 
 from tailgate.base.errors import InputError
-from tailgate.cli.shared import Commands, print_json, say
+from tailgate.cli.shared import Commands, own_classes, print_json, say
 
 
 def add(commands: Commands) -> None:
@@ -76,7 +75,7 @@ def _replay(options: argparse.Namespace) -> int:
     viewer = Viewer(options.viewer, _size(options.size))
     defence = Spec("defence", options.defence or "none")
     if defence.imports or defence.sandboxed or Spec("attack", options.attack or "none").imports:
-        sys.path.insert(0, "")  # the class that the user names is looked for in the working directory, and nothing else is
+        own_classes()  # of what the user names; a row's own text imports nothing
     wanted = Filter(options.line, options.scenario, options.defence, options.attack, _dose(options.dose), options.seed)
     source = Path(options.rows)
     chosen = choose(read_rows(source), wanted)

@@ -14,7 +14,8 @@ from typing import Any, TypeAlias, TypeVar
 
 from rich.console import Console
 
-from tailgate.base.errors import InputError
+from tailgate.base import own_modules
+from tailgate.base.errors import InputError, one_line
 from tailgate.base.plots import FORMS
 from tailgate.base.progress import Update, console, progress
 from tailgate.cli.tables import table as table
@@ -66,8 +67,8 @@ def drawn_by(report: dict[str, Any]) -> str:
 
 
 def own_classes() -> None:
-    """Look for module:Class in the working directory, as `python -m` does."""
-    sys.path.insert(0, "")
+    """Look for module:Class in the working directory too, behind the installed packages."""
+    own_modules.allow()
 
 
 def values(option: str, texts: Iterable[str], example: str = "") -> dict[str, Any]:
@@ -114,7 +115,7 @@ def counted(update: Update, label: str, of: str = "cells") -> Callable[[int, int
 
 def tell(text: str) -> None:
     """Print a line for people on standard error."""
-    print(f"tailgate: {text}", file=sys.stderr)
+    print(f"tailgate: {one_line(text)}", file=sys.stderr)
 
 
 def print_json(data: object) -> None:
@@ -128,8 +129,8 @@ def show(options: argparse.Namespace, data: T, tables: Callable[[T], None]) -> N
 
 
 def say(text: str, soft_wrap: bool = False) -> None:
-    """Print a line on standard output, as it is."""
-    console().print(text, markup=False, highlight=False, soft_wrap=soft_wrap)
+    """Print a line on standard output, without markup and control characters."""
+    console().print("\n".join(map(one_line, text.split("\n"))), markup=False, highlight=False, soft_wrap=soft_wrap)
 
 
 def say_most(lines: Sequence[str], more: str = MORE, soft_wrap: bool = False) -> None:

@@ -12,6 +12,7 @@ from rich.cells import cell_len
 from rich.markup import escape
 from rich.table import Table
 
+from tailgate.base.errors import one_line
 from tailgate.base.progress import console
 
 PIECE = re.compile(r"[^\s,:]*[,:]+|[^\s,:]+|\s+")  # of a text: a line may end behind each
@@ -64,8 +65,8 @@ def table(
 
 
 def _whole(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: Container[int]) -> _Form:
-    """Return a table with a text in each place; a row may end early."""
-    filled = [[*row, *[""] * (len(columns) - len(row))] for row in rows]
+    """Return a table with a text in each place, without control characters: rows may be anybody's. A row may end early."""
+    filled = [["\n".join(map(one_line, text.split("\n"))) for text in (*row, *[""] * (len(columns) - len(row)))] for row in rows]
     return _Form(list(columns), filled, [i in numbers for i in range(len(columns))], [])
 
 

@@ -9,6 +9,7 @@ import traceback
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+from tailgate.base import own_modules
 from tailgate.base.errors import InputError, unknown
 
 SHOWN = 12  # classes that an error names, at most
@@ -41,6 +42,7 @@ def attribute_of(family: str, text: str, fits: Callable[[object], bool], kind: s
     fits: if an object of that module is of this kind, a word.
     """
     module, _, name = text.partition(":")
+    own_modules.join()
     try:
         held = importlib.import_module(module)
         found = getattr(held, name, None)

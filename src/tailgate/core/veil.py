@@ -21,7 +21,8 @@ def veiled() -> Iterator[None]:
 
     Training seeds are small numbers, and episodes are counted.
     A class that recognised them could be weak in training and strong where it is scored.
-    The keys of its draws are therefore hashed with a secret, which is new each time, and with the row: attacks may share episodes.
+    The keys of its draws are therefore hashed with a secret, which is new each time. Rows of one episode keep one key, as where they count:
+    their readings are alike as well.
     """
     token = _veil.set(os.urandom(32))
     try:

@@ -36,7 +36,7 @@ class Code:
             return state, {str(i): x for i, x in enumerate(function(*given.values()))}
 
         trace = traced(named, None, {str(i): np.zeros(1, dtype) for i in range(inputs)})
-        program = Program(trace)
+        program = Program(trace, basic=True)
         self._function, self._lanes, self._size = program.function, program.lanes, program.room
         self._uniforms, self._inputs, self._outputs = program.uniforms(), inputs, len(trace.results)
         (self._dtype,) = {nodes.flat[0].dtype for nodes in trace.results.values()}
@@ -152,7 +152,7 @@ class Shaped:
         with np.errstate(all="ignore"):
             made = map_leaves(np.zeros_like, arranged(example, constants))
         try:
-            program = Program(traced(step, {"given": example, "made": made}, None))
+            program = Program(traced(step, {"given": example, "made": made}, None), basic=True)
         except Untraceable:  # too large: numpy computes it
             return None, np.empty(0)
         several[:] = [*several[1 - EACH :], (Answers([program.trace.graph]), program)]

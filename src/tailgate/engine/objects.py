@@ -10,6 +10,8 @@ import contextlib
 import ctypes
 import hashlib
 import os
+import shutil
+import stat
 import threading
 from collections.abc import Sequence
 from functools import cache
@@ -20,6 +22,7 @@ from tailgate.base.errors import InputError
 
 VERSION = b"2"  # of this module's translation
 KEPT = 4000  # most recently used files in the folder
+BASIC = ".basic.o"  # how the names of the code of `tailgate.num` end
 _lock = threading.RLock()
 
 
@@ -67,10 +70,30 @@ def folder() -> Path | None:
         base = os.environ.get("TAILGATE_CACHE") or os.path.join(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "tailgate")
         place = Path(base) / "objects"
         place.mkdir(parents=True, exist_ok=True, mode=0o700)
-        found = place.stat()
-        if not hasattr(os, "getuid") or (found.st_uid == os.getuid() and not found.st_mode & 0o022):
+        if not hasattr(os, "getuid") or _safe(str(place.resolve())):
             return place
     return None
+
+
+@cache
+def _safe(place: str) -> bool:
+    """Return whether a folder is the user's alone, and no other user may put another one in its place."""
+    found = os.stat(place)
+    own = found.st_uid == os.getuid() and not found.st_mode & 0o022
+    above = [os.stat(folder) for folder in Path(place).parents]
+    return own and all(
+        one.st_uid in (0, os.getuid()) and (not one.st_mode & 0o022 or bool(one.st_mode & stat.S_ISVTX)) for one in above
+    )
+
+
+def copied_to(place: Path) -> Path:
+    """Make a folder with copies of the code of basic functions: the originals' times would tell a sandbox what else is played here."""
+    place.mkdir()
+    if (source := folder()) is not None:
+        for path in source.glob(f"*{BASIC}"):
+            with contextlib.suppress(OSError):  # removed meanwhile
+                shutil.copyfile(path, place / path.name)
+    return place
 
 
 def kept(name: str) -> bytes | None:
@@ -125,11 +148,11 @@ def prove(names: Sequence[str]) -> None:
 class Function:
     """The compiled functions `step`, and `bound`, which takes the address of its arguments. Calls release Python's lock."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text: str, basic: bool = False) -> None:
         with _lock:
             binding = _binding()
             key = "\0".join((text, str(level()), *processor(), binding.llvm_version_info and str(binding.llvm_version_info))).encode()
-            name = hashlib.sha256(VERSION + key).hexdigest() + ".o"
+            name = hashlib.sha256(VERSION + key).hexdigest() + (BASIC if basic else ".o")
             content = kept(name)
             self.name, self.fresh = name, content is None
             if content is None:

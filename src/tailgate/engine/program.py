@@ -39,9 +39,14 @@ T = TypeVar("T")
 class Program:
     """The machine code of a trace."""
 
-    def __init__(self, trace: Trace, lanes: int | None = None, least: int = LEAST, twins: Mapping[str, str] | None = None) -> None:
-        """Compile a trace; `twins` maps leaves of the state to others that always equal them and share their place."""
-        self.trace, self.lanes, self._twins = trace, lanes or objects.lanes(), dict(twins or {})
+    def __init__(
+        self, trace: Trace, lanes: int | None = None, least: int = LEAST, twins: Mapping[str, str] | None = None, basic: bool = False
+    ) -> None:
+        """Compile a trace; `twins` maps leaves of the state to others that always equal them and share their place.
+
+        basic: it is a function of `tailgate.num`, whose code processes in a sandbox get too.
+        """
+        self.basic, self.trace, self.lanes, self._twins = basic, trace, lanes or objects.lanes(), dict(twins or {})
         self.places, self.stride = self._places()
         self.arrays = [("arguments", name) for name in trace.arguments] + [("results", name) for name in trace.results]
         demanded = list(trace.results["demands"].flat) if "demands" in trace.results else []
@@ -70,7 +75,7 @@ class Program:
     def _compiled(self, layout: Layout, least: int) -> tuple[str, dict[str, int], int, objects.Function]:
         """Return the text, its numbers of nodes and branches, the bytes of its buffers, and the machine code."""
         text, size, room = text_of(layout, len(self.arrays), self.lanes, least)
-        return text, size, room, objects.Function(text)
+        return text, size, room, objects.Function(text, self.basic)
 
     def rows(self, episodes: int) -> State:
         """Return a state of some episodes."""

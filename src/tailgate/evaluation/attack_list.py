@@ -1,6 +1,7 @@
 """The list of attacks that were admitted after a suite was published: results/SUITE/attacks.jsonl, which only ever grows.
 
-A line holds the hash of the line before it, and a hash of itself. A line that was changed, moved or removed is refused.
+A line holds the hash of the line before it, and a hash of itself. A line that was changed, moved or removed between others is refused.
+The hashes have no key: who changes a line on purpose can make them again, which the repository's history shows.
 A try that failed is a line too. A wrong attack stays, and a later line, an erratum, takes it back.
 """
 

@@ -135,7 +135,7 @@ def _shown(plan: IsolatedPlan, draws: Draws) -> tuple[Array, Array]:
     else:
         stale, shown = (held.key != draws.key) | (held.episode != draws.episode), held.shown.copy()
     for i in np.flatnonzero(stale):
-        digest = hashlib.blake2b(f"{i}/{int(draws.key[i])}/{int(draws.episode[i])}".encode(), key=veil, digest_size=8).digest()
+        digest = hashlib.blake2b(f"{int(draws.key[i])}/{int(draws.episode[i])}".encode(), key=veil, digest_size=8).digest()
         shown[i] = int.from_bytes(digest, "little")
     plan.veiled = Veiled(draws.key.copy(), draws.episode.copy(), shown, veil)
     return shown, np.zeros_like(draws.episode)

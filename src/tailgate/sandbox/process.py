@@ -22,6 +22,7 @@ from tailgate.base.errors import InputError, NotApplicable
 from tailgate.base.version import FOLDER, VERSION
 from tailgate.core import Array
 from tailgate.core.registry import USES
+from tailgate.sandbox.calls import FILTER, program
 from tailgate.sandbox.limits import Limits, Lost
 from tailgate.sandbox.sandbox import HOME, Sandbox
 from tailgate.sandbox.wire import LINE, Outputs, line, pack, printable
@@ -75,7 +76,7 @@ class Process:
         job = {
             "command": command, "environment": outside, "scratch": str(self.scratch), "pipes": [child_in, child_out], "after": after,
             "remove": [str(self.scratch), str(self.folder)], "cpu": self.granted, "memory": self.limits.memory,
-            "output": self.limits.output, "cpu_limit": self.limits.cpu,
+            "output": self.limits.output, "cpu_limit": self.limits.cpu, "filter": program().hex(), "filter_word": FILTER,
             "processes": self.limits.processes + (0 if sandbox is None else sandbox.processes),
         }  # fmt: skip
         try:

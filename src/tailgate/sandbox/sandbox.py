@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import sys
 import uuid
@@ -14,11 +15,13 @@ from typing import Literal, get_args
 from tailgate.base.errors import InputError
 from tailgate.base.version import FOLDER
 from tailgate.core import param
-from tailgate.engine.objects import folder as kept_objects
+from tailgate.engine.objects import copied_to
+from tailgate.sandbox.calls import FILTER, program
 from tailgate.sandbox.limits import Limits
 
 Program = Literal["bwrap", "docker"]
 HOME = "/scratch"  # working directory of a sandboxed submission
+IMAGE = re.compile(r"[a-z0-9][\w./:@-]*")  # never an option of the client
 _SYSTEM = ("/usr", "/bin", "/lib", "/lib32", "/lib64", "/etc/ld.so.cache", "/etc/alternatives")
 
 
@@ -44,7 +47,8 @@ class Sandbox:
         if shutil.which(self.program) is None:
             raise InputError("sandbox", self.program, f"an installed program: {self.program} is not on the PATH")
         if self.program == "bwrap":
-            return [*bwrap(folder, source, limits), sys.executable, *module], []
+            copied = copied_to(folder / "objects")
+            return [*bwrap(folder, source, limits, copied), sys.executable, *module], []
         name = f"tailgate-{uuid.uuid4().hex}"
         return [*docker(name, folder, source, environment, limits), self.image, "python", *module], ["docker", "rm", "--force", name]
 
@@ -60,13 +64,19 @@ def sandbox_of(text: str | None) -> Sandbox | None:
     program, _, image = text.partition(":")
     if program not in get_args(Program) or (image and program != "docker"):
         raise InputError("sandbox", text, "bwrap, docker or docker:IMAGE")
+    if image and not IMAGE.fullmatch(image):
+        raise InputError("sandbox", text, "docker:IMAGE with the name of an image")
     if shutil.which(program) is None:
         raise InputError("sandbox", text, f"an installed program: {program} is not on the PATH")
     return Sandbox(program, image) if image else Sandbox(program)  # type: ignore[arg-type]
 
 
-def bwrap(folder: Path, source: Path | None, limits: Limits) -> list[str]:
-    """Return bubblewrap's command: new namespaces, so no network and no other process; all but `out` is read-only."""
+def bwrap(folder: Path, source: Path | None, limits: Limits, objects: Path) -> list[str]:
+    """Return bubblewrap's command: new namespaces, so no network and no other process.
+
+    All is read-only but `out` and three directories in memory. `objects` is a copy of machine code. The guard puts the descriptor of the
+    filter of calls in the place of the word FILTER.
+    """
     package = FOLDER
     parts = [package, *(path.resolve() for path in package.iterdir() if path.is_symlink())]
     prefixes = dict.fromkeys(str(Path(path)) for path in (sys.prefix, sys.base_prefix, *map(str, parts)))
@@ -79,12 +89,12 @@ def bwrap(folder: Path, source: Path | None, limits: Limits) -> list[str]:
     for prefix in prefixes:
         if not any(prefix == path or prefix.startswith(f"{path}/") for path in _SYSTEM):
             out += ["--ro-bind", prefix, prefix]
-    if objects := kept_objects():  # machine code of products and inverses, read-only
-        out += ["--ro-bind", str(objects), f"{HOME}/.cache/tailgate/objects"]
+    out += ["--ro-bind", str(objects), f"{HOME}/.cache/tailgate/objects"]
     out += ["--ro-bind", str(folder / "in"), str(folder / "in"), "--bind", str(folder / "out"), str(folder / "out")]
     if source is not None:
         out += ["--ro-bind", str(source), str(source)]
-    return [*out, "--chdir", HOME, "--"]
+    filtered = ["--seccomp", FILTER] if program() else []
+    return [*out, "--remount-ro", "/dev", "--remount-ro", "/", *filtered, "--chdir", HOME, "--"]
 
 
 def docker(name: str, folder: Path, source: Path | None, environment: dict[str, str], limits: Limits) -> list[str]:
@@ -92,7 +102,9 @@ def docker(name: str, folder: Path, source: Path | None, environment: dict[str, 
     out = ["docker", "run", "--rm", "--interactive", "--init", "--pull", "never", "--name", name, "--network", "none", "--cap-drop", "ALL"]
     out += ["--security-opt", "no-new-privileges", "--ipc", "none", "--user", f"{os.getuid()}:{os.getgid()}"]
     out += ["--pids-limit", str(32 + limits.processes), "--memory", str(limits.memory), "--memory-swap", str(limits.memory)]
-    out += ["--tmpfs", f"{HOME}:rw,mode=1777,size={limits.file_size}", "--workdir", HOME]
+    for path in ("/tmp", HOME):
+        out += ["--tmpfs", f"{path}:rw,mode=1777,size={limits.file_size}"]
+    out += ["--read-only", "--workdir", HOME]
     for key, value in environment.items():
         if key not in ("PATH", "LD_LIBRARY_PATH", "PYTHONPATH"):  # the image has its own
             out += ["--env", f"{key}={value}"]

@@ -9,9 +9,11 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.machinery import PathFinder
 from importlib.metadata import entry_points
 from pathlib import Path
 
+from tailgate.base import own_modules
 from tailgate.base.errors import InputError
 from tailgate.core.spec_text import split_text
 
@@ -45,8 +47,8 @@ def named(text: str) -> str:
 def _files(module: str) -> tuple[Path, list[Path], bool]:
     """Return the folder and files of a top-level module, and True if it is a package, without importing it."""
     top = module.partition(".")[0]
-    try:
-        spec = importlib.util.find_spec(top)
+    try:  # the path itself stays without the working directory, where a stranger's files may lie
+        spec = PathFinder.find_spec(top, own_modules.folders()) or importlib.util.find_spec(top)
     except (ImportError, ValueError):
         spec = None
     if spec is None:
