@@ -15,11 +15,12 @@ import tailgate
 from tailgate.base.errors import InputError
 from tailgate.base.version import plays_as
 from tailgate.board.check import check, with_check
-from tailgate.board.consistency import strays
+from tailgate.board.consistency import strays, undue
 from tailgate.board.files import board_in, load
 from tailgate.board.score import score
 from tailgate.cli import check as command
 from tailgate.core.scenario import load_suite
+from tailgate.evaluation.attack_list import Admitted, append
 from tailgate.evaluation.cells import cells_of, run
 from tailgate.evaluation.rows import encode
 from tailgate.site.build import build_site
@@ -79,7 +80,22 @@ def published() -> Data:
 @pytest.mark.thin(22)
 def test_what_is_published_follows_from_its_cells(name: str) -> None:
     board = load(board_in(ROOT / f"results/{name}"))
-    assert strays(board, load_suite(name)) == []
+    assert strays(board, load_suite(name)) == [] == undue(board, load_suite(name))
+
+
+def test_a_board_does_not_decide_which_attacks_count(published: Data, tmp_path: Path) -> None:
+    """Computed optima alone do not, and what an erratum took back; nor does it choose its limit or level."""
+    suite, listed = load_suite("quick-v0"), tmp_path / "attacks.jsonl"
+    one, other = dict.fromkeys(cell["attack"] for cell in published["cells"] if cell["attack"] != "none").keys() & set(suite.attacks[:3])
+    for cell in published["cells"]:
+        cell["optimal"] = cell["attack"] == one
+    next(attack for attack in published["attacks"] if attack["attack"] == other)["withdrawn"] = True
+    published["suite"] |= {"limit": 0.6, "alpha": 0.9}
+    wanted = ["suite.limit", "suite.alpha", f"attacks: {one}: optimal"]
+    assert [line["field"] for line in undue(published, suite, listed)] == [*wanted, f"attacks: {other}: withdrawn"]
+    append(listed, Admitted(other, "", "black", "2026-01-01", erratum="it was mistaken"))
+    assert [line["field"] for line in undue(published, suite, listed)] == wanted
+    assert set(wanted) <= {line["field"] for line in check(published, sample=1, listed=listed)["strays"]}
 
 
 @pytest.mark.long

@@ -43,7 +43,8 @@ def test_every_figure_of_the_csv_is_that_of_the_board(name: str) -> None:
             "undamaged": rate["undamaged"]["value"], "undamaged_low": rate["undamaged"]["low"], "attacks": rate["attacks"],
             "worst_scenario": rate["worst"]["scenario"], "worst_attack": rate["worst"]["attack"], "no_attack_damages": none["value"],
             "no_attack_damages_low": none["low"], "no_attack_damages_high": none["high"], "impact_mean": hard.get("mean"),
-            "impact_q90": hard.get("q90"), "distance_kept": harm.get("availability"), "distance_kept_least": (harm.get("least") or {}).get("value"),
+            "impact_q90": hard.get("q90") if hard.get("measured", 0) >= 10 else None, "impacts": hard.get("measured"), "impact_most": hard.get("most"),
+            "distance_kept": harm.get("availability"), "distance_kept_least": (harm.get("least") or {}).get("value"),
             "mean_gap_change": entry["mean_gap"]["value"] if entry["mean_gap"] else None,
         } | {
             f"critical_dose{end}": "above" if dose[key] is None else "below" if 0 < dose[key] <= smallest else dose[key]

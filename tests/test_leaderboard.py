@@ -79,6 +79,15 @@ def test_no_rows_is_an_input_error(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(("field", "value"), [("purpose", "tune"), ("config_hash", "def456"), ("version", "0.2.0")])
+def test_rows_of_two_kinds_do_not_share_a_cell(tmp_path, field, value):
+    """Which of them would be the cell's figure? Nothing is written."""
+    with pytest.raises(InputError, match=field):
+        build([*cell("kf", JAM, 12), *cell("kf", JAM, 2, **{field: value})], tmp_path / "page")
+    assert not (tmp_path / "page").exists()
+    build([*cell("kf", JAM, 12), *cell("kf", JAM, 2, knowledge="white", **{field: value})], tmp_path / "page")
+
+
 def test_the_order_is_that_of_the_page(page):
     text = page.read_text(encoding="utf-8")
     marks = ["<h1>", "lower is better", "Learned beats", "Learning curve", 'class="heat"', 'class="cells"', '<h2 id="defences"', "<footer"]

@@ -84,6 +84,16 @@ def test_weights_of_another_training_are_found(policies: list[Path], tmp_path: P
     assert "1 of 1 policies have the same weights" in " ".join(capsys.readouterr().out.split())
 
 
+def test_a_policy_that_decides_otherwise_is_another_one(policies: list[Path], tmp_path: Path) -> None:
+    """The weights alone do not say what an output does."""
+    data = json.loads(policies[0].read_text())
+    for name, value in (("action", data["action"] | {"value": -9.0}), ("squashed", True), ("knowledge", "grey")):
+        copy = _changed(policies[0], tmp_path)
+        copy.write_text(json.dumps(data | {name: value}))
+        again = retrain(str(copy))
+        assert again.verdict == "differs" and name in again.why and again.here == again.sha256
+
+
 def test_what_cannot_be_trained_again_is_said(policies: list[Path], tmp_path: Path) -> None:
     config = json.loads(policies[0].read_text())["training"]["config"]
     for changes, words in (

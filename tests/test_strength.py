@@ -92,7 +92,7 @@ def test_a_policy_without_timing_is_flagged(tmp_path: Path, brief_place: str) ->
     report = timing(texts, scenario=brief_place, episodes=12)
     (entry,) = report["entries"]
     assert [p["seed"] for p in entry["policies"]] == [0, 1]
-    assert entry["advantage"]["yoked"]["value"] == 0.0 and entry["flags"] == ["yoked equals own"]
+    assert entry["advantage"]["yoked"]["value"] == 0.0 and entry["flags"] == ["timing not shown to matter"]
     assert entry["attack_steps"] == {"own": 20.0, "yoked": 20.0, "shuffled": 20.0, "periodic": 20.0}
     assert entry["threat_model"]["budget"] == 20 and entry["defence"] == "chi2_kf"
 

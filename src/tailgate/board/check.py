@@ -25,7 +25,7 @@ from tailgate.evaluation.paired import CLOSE, PAIR
 from tailgate.evaluation.rows import CLEAN, Row
 
 from .cells import PRINTS, compared, figures, shared_of
-from .consistency import same, sharpened, strays, untold
+from .consistency import same, sharpened, strays, undue, untold
 from .damage import reach_of
 from .entry import PROVISIONAL
 from .files import amended, known, read_board, suite_of
@@ -40,7 +40,7 @@ EPISODES = 20_000  # whose rows are held at a time
 
 def check(
     data: Data, *, sample: int | None = None, sample_seed: int = 0, defences: Sequence[str] = (), workers: int = 1,
-    progress: Callable[[int, int], None] | None = None,
+    listed: Path | None = None, progress: Callable[[int, int], None] | None = None,
 ) -> Data:  # fmt: skip
     """Play the cells of a board again, and compare numbers of episodes, damage and fingerprints.
 
@@ -52,6 +52,8 @@ def check(
         Number of cells, drawn by `sample_seed`; by default all.
     defences : sequence of str
         Only the cells of these.
+    listed : Path, optional
+        The list of admitted and withdrawn attacks beside the board; by default the package's.
 
     Returns
     -------
@@ -61,7 +63,8 @@ def check(
         - `counts` of cells, and `entries`: the same for each defence;
         - `findings`: cells that differ or could not be checked, with `reasons`;
         - `untrained`: attackers without files, which `leaderboard attack` would train again to the same weights;
-        - `strays`: figures that do not follow from the cells, by `defence` and `field`;
+        - `strays`: figures that do not follow from the cells, and attacks that the board leaves out against the rules, by `defence`
+          and `field`;
         - `untold`: ranked entries whose cells do not say which episodes came to damage, so that their comparisons are limits only;
         - `scored`: true if all cells were played, so that ranks, gates and all other figures were made again;
         - `prints`: hits and fingerprints of each equal cell, by its index in the board.
@@ -98,7 +101,7 @@ def check(
 
     files = {attack.attack: attack.digest for attack in board.attacks}
     seen = again(asked, lambda i: _cell(board.cells[i], board, suite), play, lambda i, here: _compared(board.cells[i], here, files))
-    off = strays(data, suite)
+    off = strays(data, suite) + undue(data, suite, listed)
     listed = {(stray["defence"], stray["field"]) for stray in off}
     off += [stray for stray in _scored(data, held, suite) if (stray["defence"], stray["field"]) not in listed]
     more = {"strays": off, "untold": untold(data, suite), "scored": bool(held)}

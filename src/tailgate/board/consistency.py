@@ -5,11 +5,17 @@ Shares of damage decide its rates, critical doses, curves and robustness. Damage
 
 from __future__ import annotations
 
+import contextlib
 import math
+from pathlib import Path
 
+from tailgate.base.errors import InputError
+from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite
 from tailgate.core.threat import KNOWLEDGE
+from tailgate.evaluation.attack_list import list_of, taken_back
 from tailgate.evaluation.paired import CLOSE, class_of, compare, settled
+from tailgate.studies.dose import CRITICAL
 
 from .cells import hits_of, share, table_of, vague
 from .damage import doses_of
@@ -17,6 +23,8 @@ from .entry import Levels, curves, middle, of_worst, shown
 from .files import amended
 from .schema import Data
 from .worst import Worst
+
+ALPHA = 0.05  # of every board that the commands make
 
 
 def strays(board: Data, suite: Suite) -> list[Data]:
@@ -36,7 +44,7 @@ def strays(board: Data, suite: Suite) -> list[Data]:
         here = share(int(hits_of(cell).sum()), cell["n"])._asdict() if cell["n"] else None
         if not same(cell["damage"], here):
             out.append(_stray(cell["defence"], f"cells[{i}].damage", cell["damage"], here))
-    dose, alpha = middle(suite), held.get("alpha", 0.05)
+    dose, alpha = middle(suite), held.get("alpha", ALPHA)
     levels: Levels = {name: {k: Worst(table, name, k, alpha) for k in KNOWLEDGE} for name in table.defences}
     for entry in board["entries"]:
         name = entry["defence"]
@@ -50,6 +58,25 @@ def strays(board: Data, suite: Suite) -> list[Data]:
             where, attacker = lost[0][0], table.attackers[lost[0][1]]
             out.append(_stray(name, "status", entry["status"], f"unranked: not all cells of {attacker.attack} on {where} are there"))
     return out + _ranks(board, levels, dose, alpha)
+
+
+def undue(board: Data, suite: Suite, listed: Path | None = None) -> list[Data]:
+    """Return what a board decides by itself though the rules do: its limit and level, and attacks that it does not count.
+
+    A computed optimum does not count, nor an attack that an erratum took back: in the list at `listed`, or else in the package's.
+    """
+    held, out = board["suite"], []
+    for key, here in (("limit", CRITICAL), ("alpha", ALPHA)):
+        if not same(held.get(key, here), here):
+            out.append(_stray("", f"suite.{key}", held[key], here))
+    for text in dict.fromkeys(cell["attack"] for cell in board["cells"] if cell.get("optimal")):
+        spec = Spec("attack", text)
+        with contextlib.suppress(InputError):  # a name that is not known here: its cells cannot be played either
+            if spec.imports or not spec.entry.optimal:
+                out.append(_stray("", f"attacks: {text}: optimal", True, False))
+    marked = {attack["attack"] for attack in board["attacks"] if attack.get("withdrawn")}
+    left = sorted(marked.difference(taken_back(list_of(suite, listed))))
+    return out + [_stray("", f"attacks: {text}: withdrawn", True, False) for text in left]
 
 
 def untold(board: Data, suite: Suite) -> list[str]:
@@ -96,7 +123,7 @@ def sharpened(board: Data, suite: Suite) -> Data:
     before = board.get("comparisons", [])
     if not any(duel.get("bound") for duel in before):
         return board
-    table, dose, alpha = table_of(board, suite), middle(suite), board["suite"].get("alpha", 0.05)
+    table, dose, alpha = table_of(board, suite), middle(suite), board["suite"].get("alpha", ALPHA)
     duels: list[Data] = []
     ranks: dict[str, Data] = {}
     for group in dict.fromkeys(duel.get("class", "") for duel in before):

@@ -17,6 +17,7 @@ from tailgate.base.pytree import Array
 
 from .files import read_board
 from .head import filled_columns, lines, title
+from .measures import SOME
 from .order import ordered
 from .schema import Curve, Data, Entry, Point, Rate
 
@@ -32,8 +33,9 @@ SIGNS = {"<=": r"$\leq$", ">=": r"$\geq$"}
 TITLE = "Tailgate: a benchmark in which an adversary learns when to attack the sensors of adaptive cruise control"  # as in CITATION.cff
 COLUMNS = (
     "defence", "class", "status", "why", "rank_best", "rank_worst", "ranked_in_class", "knowledge", "dose", "undamaged", "undamaged_low",
-    "attacks", "worst_scenario", "worst_attack", "no_attack_damages", "no_attack_damages_low", "no_attack_damages_high", "impact_mean",
-    "impact_q90", "distance_kept", "distance_kept_least", "critical_dose", "critical_dose_low", "critical_dose_high", "mean_gap_change",
+    "attacks", "worst_scenario", "worst_attack", "no_attack_damages", "no_attack_damages_low", "no_attack_damages_high", "impacts",
+    "impact_mean", "impact_q90", "impact_most", "distance_kept", "distance_kept_least", "critical_dose", "critical_dose_low",
+    "critical_dose_high", "mean_gap_change",
 )  # fmt: skip
 DRAWN = 8  # defences with a colour in the figure; the others are grey
 
@@ -110,7 +112,10 @@ def _figures(entry: Entry, rate: Rate, doses: Sequence[int | None]) -> dict[str,
         out |= {"no_attack_damages": none.value, "no_attack_damages_low": none.low, "no_attack_damages_high": none.high}
     harm = next((line for line in entry.under_attack if (line.dose, line.knowledge) == at), None)
     if harm:
-        out |= {"impact_mean": harm.severity.mean, "impact_q90": harm.severity.q90, "distance_kept": harm.availability}
+        hard = harm.severity
+        q90 = hard.q90 if hard.measured >= SOME else None  # of few, the greatest says more
+        out |= {"impacts": hard.measured, "impact_mean": hard.mean, "impact_q90": q90, "impact_most": hard.most}
+        out["distance_kept"] = harm.availability
         out["distance_kept_least"] = harm.least.value if harm.least else None
     critical = entry.critical_dose.get(rate.knowledge)
     if critical:

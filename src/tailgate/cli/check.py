@@ -41,6 +41,7 @@ def _check(options: argparse.Namespace) -> int:
     from tailgate.board.check import check, with_check
     from tailgate.board.detect import check_detection
     from tailgate.board.files import load, save
+    from tailgate.board.run import LIST
 
     if options.detection and options.write:
         raise InputError("--write", True, "the cells of a board, without --detection")
@@ -51,7 +52,7 @@ def _check(options: argparse.Namespace) -> int:
         if options.detection:
             report = check_detection(board, **asked, progress=update)
         else:
-            report = check(board, **asked, progress=counted(update, "playing"))
+            report = check(board, **asked, listed=path.parent / LIST, progress=counted(update, "playing"))
     if options.write:
         with alone(path.parent):  # others may have written meanwhile
             save(with_check(load(path), report), path)
@@ -107,7 +108,7 @@ def _print(report: dict[str, Any]) -> None:
     say_most(lines, soft_wrap=True)
     if not report["scored"]:
         which = "Comparisons, gates" if report["untold"] else "Gates"
-        say(f"{which} and clean figures were not made again: that takes all cells of the board.")
+        say(f"{which}, flags, clean figures, impacts and distances were not made again: that takes all cells of the board.")
     elif not strays:
         say("Ranks, gates and clean figures came out as the board says.")
     wrong = [finding for finding in report["findings"] if finding["verdict"] == "differs"]

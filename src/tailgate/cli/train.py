@@ -116,7 +116,7 @@ def _print_report(report: dict[str, Any]) -> None:
     for name, why in report["left_out"].items():
         say(f"left out: {name} ({why})")
     for name, gain in report["advantage"].items():
-        verdict = "wins" if gain["low"] > 0 else "loses" if gain["high"] < 0 else "equal" if gain["value"] == 0 else "undecided"
+        verdict = "wins" if gain["low"] > 0 else "loses" if gain["high"] < 0 else "undecided"
         scale, points = (100.0, " points") if report["unit"] == SHARE else (1.0, "")
         value, low, high = (f"{scale * gain[key]:+.{1 if points else 3}f}" for key in ("value", "low", "high"))
         say(f"learned against {name}: {value}{points}, 95 % interval {low} to {high} ({verdict})")

@@ -112,7 +112,13 @@ def paired_difference(a: Array, b: Array, level: float = 0.95, resamples: int = 
         spread = float(special.stdtrit(runs - 1, (1 + level) / 2) * delta.mean(axis=1).std(ddof=1) / np.sqrt(runs))
     unseen = 1.0 - ((1.0 - level) / 2.0) ** (1.0 / episodes) if share else 0.0  # the largest probability of an event that never occurred
     below, above = max(value - low, unseen * (value + 1.0)), max(high - value, unseen * (1.0 - value))
-    return Interval(value, value - float(np.hypot(below, spread)), value + float(np.hypot(above, spread)))
+    return around(value, np.hypot(below, spread), np.hypot(above, spread), share)
+
+
+def around(value: float, below: float, above: float, share: bool) -> Interval:
+    """Return a difference with what lies below and above it; that of two shares is between -1 and 1."""
+    most = 1.0 if share else np.inf
+    return Interval(value, max(value - float(below), -most), min(value + float(above), most))
 
 
 def paired_ratio(a: Array, b: Array, level: float = 0.95, resamples: int = 4000, seed: int = 0) -> Interval:

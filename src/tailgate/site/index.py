@@ -57,11 +57,12 @@ def heat_of(suite: Suite) -> Data | None:
     apart = optimal | {(c.attack, c.knowledge) for c in board.cells if c.attack in withdrawn}
     learned = {(c.attack, c.knowledge) for c in board.cells if c.learned}
     own = _trained_for(suite)
+    scripts = {c.knowledge for c in board.cells if c.attack in own and not c.learned}  # searched attacks are learned in part
     columns = list(dict.fromkeys((OWN if c.attack in own else c.attack, c.knowledge) for c in board.cells))
     columns.sort(key=lambda c: (c in optimal, LEVELS.index(c[1]), c[0] != OWN))
     heads = [
         {"name": TRAINED if a == OWN else suite.attacks[a], "knowledge": k, "optimal": (a, k) in optimal,
-         "learned": (a, k) in learned or a == OWN or suite.attacks[a].policy}
+         "learned": (k not in scripts) if a == OWN else (a, k) in learned or suite.attacks[a].policy}
         for a, k in columns
     ]  # fmt: skip
     scenarios = [s.name for s in board.suite.scenarios]
@@ -282,6 +283,7 @@ def section(suite: Suite, measured: Attachments) -> Data:
         "trust": trust_of(suite), "damage": suite.damage, "folder": suite.folder,
         "count": len(rows), "several": len(board.suite.doses) > 1, "doses": doses, "measures": measures.columns_of(suite),
         "all_doses": ", ".join(dose_text(d) for d in board.suite.doses), "limit": percent(board.suite.limit),
+        "level": percent(1.0 - board.suite.alpha),
         "groups": [g for g in groups if g["rows"]], "classes": sorted({r["class"] for r in rows}),
         "statuses": [s for s, *_ in GROUPS if any(r["status"] == s for r in rows)], "levels": LEVELS,
         "heat": heat_of(suite), "scale": suite.scale, "together": together_of(suite), "curves": curves_of(suite),

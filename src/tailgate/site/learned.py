@@ -90,6 +90,8 @@ def _burst(trace: Trace, row: int, steps: Array) -> str:
     valued = any(EFFECTS[int(kind)].valued for kind in trace.kind[steps, row])
     low, high = (f"{bound:.3g}" for bound in (values.min(), values.max()))
     size = "" if not valued else f", {low}" if low == high else f", {low} to {high}"
+    units = {EFFECTS[int(kind)].unit for kind in trace.kind[steps, row]} if valued else {""}
+    size += f" {units.pop()}" if len(units) == 1 and "" not in units else ""
     start, end = (int(steps[0]) + 1) * trace.dt, (int(steps[-1]) + 1) * trace.dt
     when = f"{start:.1f} s" if start == end else f"{start:.1f} to {end:.1f} s"
     return f"{when}: {' and '.join(kinds)} on {', '.join(names)}{size}"

@@ -22,7 +22,8 @@
     const down = heads[column].getAttribute("aria-sort") === "descending";
     for (const body of table.tBodies) {
       const rows = [...body.rows].filter((row) => !row.classList.contains("group")).map((row) => [key(row, column, table.dataset.knows), row]);
-      rows.sort(([a], [b]) => (a === "") - (b === "") || (down ? compare(b, a) : compare(a, b)));
+      const none = (text) => text === "" || text === "\u2013";
+      rows.sort(([a], [b]) => none(a) - none(b) || (down ? compare(b, a) : compare(a, b)));
       body.append(...rows.map(([, row]) => row));
     }
   };

@@ -12,7 +12,7 @@ TIMES = (  # as the twins of tailgate.studies.timing
     "its own times", "those of another of its episodes (yoked)", "as many steps at random (shuffled)", "as many, evenly spread (periodic)",
 )  # fmt: skip
 VERDICTS = {
-    "more": "At its own times it surely does more", "equal": "At its own times it surely does hardly more",
+    "more": "At its own times it surely does more", "equal": "At its own times it does less than 10 points more (95 %, this entry alone)",
     "unknown": "It is undecided if it does more at its own times",
 }  # fmt: skip
 
@@ -49,7 +49,7 @@ def flags_of(timing: Timing | None, defence: str) -> list[str]:
     for entry in (entry for entry in timing.entries if entry.defence == defence) if timing else ():
         who = f"{names_of([entry.attack])[entry.attack].full} on {entry.scenario}"
         if entry.verdict == "equal":
-            out.append(f"yoked equals own: {who} surely does hardly more at its own times than at another episode's")
+            out.append(f"yoked equals own: {who} does less than 10 points more at its own times than at another episode's (95 %)")
         if entry.outdone:
             out.append(f"outdone by its twins: {who} surely does less at its own times than at random or evenly spread ones")
     return out

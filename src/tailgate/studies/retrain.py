@@ -12,6 +12,7 @@ from tailgate.agents.learners.learning import Progress, made_with
 from tailgate.agents.policy.network_policy import load_policy
 from tailgate.base.errors import InputError
 from tailgate.core.registry import Spec
+from tailgate.core.schema import as_data
 from tailgate.evaluation.checks import Finding, again
 from tailgate.training import train
 
@@ -19,6 +20,8 @@ from .collect import packed
 from .policies import Trained, scenario_of, trained
 
 Verdict = Literal["same", "differs", "unchecked"]
+# of a policy's file: what it sees, and how its outputs become an attack. Older files do not say `agents`
+HEADER = ("action", "observation", "knowledge", "sees_measurement", "frames", "layers", "squashed", "masked", "recurrent", "greedy")
 
 
 class Again(NamedTuple):
@@ -71,6 +74,8 @@ def _trained_again(who: Trained, config: train.TrainConfig, progress: Callable[[
         if "source_sha256" in who.header.training:  # of the zoo, whose weights are packed: these, as the record might claim any hash
             here = hashlib.sha256(packed(path.with_name(made.tensors))).hexdigest()
     steps = int(made.training["steps"])
+    if off := [name for name in HEADER if as_data(getattr(made, name)) != as_data(getattr(who.header, name))]:
+        return Again(text, "differs", f"{', '.join(off)}: not what its training gives it", there, here, steps)
     if here == there:
         return Again(text, "same", "", there, here, steps)
     return Again(text, "differs", f"weights {there[:12]} there, {here[:12]} here; {_unlike(who)}", there, here, steps)

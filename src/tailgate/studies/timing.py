@@ -175,5 +175,5 @@ def _entry(members: list[Trained], facts: dict[str, Any], runs: list[Played], ep
         "outcomes": {name: mean(values[name], outcome)._asdict() for name in TWINS},
         "attack_steps": {name: float(np.mean([run.steps[name] for run in runs])) for name in TWINS},
         "advantage": {name: interval._asdict() for name, interval in advantage.items()},
-        "flags": [] if advantage["yoked"].low > 0.0 else ["yoked equals own"],
+        "flags": [] if advantage["yoked"].low > 0.0 else ["timing not shown to matter"],
     }  # fmt: skip

@@ -21,7 +21,7 @@ from tailgate.core.scenario import Suite, list_suites, load_scenario, load_suite
 from tailgate.core.schema import as_data, canonical
 from tailgate.estimators.per_episode import EpisodeByEpisode
 from tailgate.evaluation.cells import Cell, cells_of, run
-from tailgate.evaluation.stats import Interval, paired_difference
+from tailgate.evaluation.stats import Interval, around, paired_difference
 from tailgate.play.metrics import unit_in
 
 from .policies import Trained, check_episodes, defence_of, distinct, is_share, mean, misfit, outcome_for, scenario_of
@@ -45,7 +45,7 @@ def difference(a: Array, b: Array, share: bool = False) -> Interval:
         freedom = variance**2 / sum(v**2 / n for v, n in parts)
         spread = float(special.stdtrit(freedom, (1 + LEVEL) / 2)) * variance**0.5
     low, high = paired.value - paired.low, paired.high - paired.value
-    return Interval(paired.value, paired.value - float(np.hypot(low, spread)), paired.value + float(np.hypot(high, spread)))
+    return around(paired.value, np.hypot(low, spread), np.hypot(high, spread), share)
 
 
 def transfer(
