@@ -1,6 +1,7 @@
 """The Kalman filter under detectors with memory and under other mitigations, named and calibrated (docs/detectors.md).
 
-Each threshold is the one for a mean time of 1 h between false alarms, as recorded in benchmarks/results/calibration.json.
+Each threshold is the one for a mean time of 1 h between false alarms in car following, whose readings are two (calibration.json in
+benchmarks/results). With more readings they alarm more often.
 """
 
 from dataclasses import dataclass

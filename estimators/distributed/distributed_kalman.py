@@ -303,10 +303,12 @@ class DistributedKalman(Composed):
 class TailChiSquare(Memoryless):
     """Alarms when the normalised innovation squared exceeds the quantile of chi-square that belongs to a false-alarm probability.
 
-    The same for any number of sensors: the thesis's threshold 20 for two sensors is 22.8 for three, and 44.7 for fourteen.
+    The same for any number of sensors: the thesis's threshold 20 for two sensors is 22.8 for three, and 44.7 for fourteen. The probability
+    is met where S is the innovation's covariance and all readings arrive. Distributed filters have an S that is too large (`dkf`) or, where
+    they cut corrections, too small.
     """
 
-    tail: Probability = param(4.54e-5, "probability of a false alarm per step and agent, above 0; exp(-10) is the thesis's [-]")
+    tail: Probability = param(4.54e-5, "nominal probability of a false alarm per step and agent, above 0; exp(-10) is the thesis's [-]")
 
     def prepare(self, model: Model) -> float:
         """Return the threshold eta."""

@@ -64,7 +64,8 @@ class Reacquire(Gate[ReacquireState]):
     """Ignores the suspected sensors, but after a number of rejections in a row starts again from what they say.
 
     It ends the lock-out, in which a wrong estimate shuts out the honest readings. An attacker who keeps lying for as long is believed as
-    well: `after` is the price. Readings that are missing neither count nor break the row.
+    well: `after` is the price. The filter also forgets states that no sensor reads. So its gate is wide for all sensors in the next step,
+    and a false value of another sensor gets in then. Readings that are missing neither count nor break the row.
     """
 
     after: PositiveCount = param(20, "readings of a sensor rejected in a row before the next one is believed")

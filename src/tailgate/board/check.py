@@ -53,7 +53,7 @@ def check(
     defences : sequence of str
         Only the cells of these.
     listed : Path, optional
-        The list of admitted and withdrawn attacks beside the board; by default the package's.
+        The list of admitted and withdrawn attacks that belongs to the board; by default the package's.
 
     Returns
     -------

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from .string_stability import peak
 SCENARIO = "platoon-braking-v0"
 LASSO = "lasso_dkf:unit=sensor,lam={}"
 DEFENCES = {"none": "none", "DKF": "dkf", "lasso": LASSO.format(LOOP_LAM)}
+LOW_LAM = 1.0  # a price at which a false reading in every step moves the estimate little
 LOW = LASSO.format(LAM)  # at the price of the thesis's figures
 ATTACKS = {
     "no attack": "none",
@@ -73,7 +75,7 @@ def parts(seeds: int, tick: Tick) -> Iterator[Part]:
         rows.append((label, *(f"{_safe(trace)} ({np.median(measure(trace)['min_gap']):.1f} m)" for trace in traces.values())))
     title = f"Runs of {seeds} without a collision (median smallest gap), followers not told u_r"
     yield Table(title, ("attack on car 2 from 20 s", *DEFENCES), tuple(rows))
-    yield from (_collision(safe, seeds), _every_step(safe, seeds), _zero_mean(safe, seeds))
+    yield from (_collision(safe, seeds), _every_step(scenario, safe, seeds), _zero_mean(safe, seeds))
     tick("closed loop: the leader's input known, and at rest")
     yield from (_known(scenario, safe, seeds), _equilibrium(scenario, seeds))
     tick("closed loop: choice of lam")
@@ -97,13 +99,18 @@ def _collision(safe: Safe, seeds: int) -> Claim:
     )  # fmt: skip
 
 
-def _every_step(safe: Safe, seeds: int) -> Claim:
+def _every_step(scenario: Scenario, safe: Safe, seeds: int) -> Claim:
     label = "+60 m, p = 1"
+    low = {what: _play(scenario, LASSO.format(LOW_LAM), ATTACKS[what], seeds) for what in ("no attack", label)}
+    count = _safe(low[label])
+    measured: dict[str, Any] = {name: _share(safe[label, name], seeds) for name in DEFENCES}
+    measured[f"lasso, lam = {LOW_LAM:g}"] = _share(count, seeds)
+    measured |= {f"error without an attack, lam = {LOW_LAM:g} [m]": round(_worst(low["no attack"]), 2)}
     return Claim(
         "6.6-every-step", "As the error is bounded (Theorem 6.5.4), the platoon is safe however often the attack comes", "bounded",
-        {name: _share(safe[label, name], seeds) for name in DEFENCES},
-        verdict(safe[label, "lasso"] == seeds, safe[label, "lasso"] < 0.05 * seeds),
-        "share of runs without a collision when car 2's distance is 60 m too large in every step; the theorem bounds a step, not their sum",
+        measured, verdict(safe[label, "lasso"] == seeds, max(safe[label, "lasso"], count) < 0.05 * seeds),
+        f"share of runs without a collision when car 2's distance is 60 m too large in every step, lam = {LOOP_LAM:g} where none is given; "
+        "the theorem bounds a step, not their sum, and a lower price trusts no reading much, honest ones included",
     )  # fmt: skip
 
 
