@@ -165,11 +165,11 @@ def test_verdicts_go_both_ways():
     worse = base | {(label, "gate"): 0.5 for label in ch5_theory.CASES} | {(far, "resilient (5.8)"): 9.0}
     assert kinds(better) == ["yes", "yes"] and kinds(worse) == ["no", "no"]
     assert kinds(better | {(near, "gate"): 0.5}) == ["yes", "partly"]
-    few = {(label, guard): 100 for label in ch6_loop.ATTACKS for guard in ch6_loop.DEFENCES}
+    few = {(label, guard): 100 for label in ch6_loop.ATTACKS for guard in (*ch6_loop.DEFENCES, "low")}
     none = dict.fromkeys(few, 0)
-    for judge in (ch6_loop._every_step, ch6_loop._collision):
-        assert judge(none, 100).holds == "no"
-    assert ch6_loop._every_step(few, 100).holds == "yes" and ch6_loop._zero_mean(few, 100).holds == "no" and ch6_loop._zero_mean(none, 100).holds == "yes"
+    every = lambda found: ch6_loop._every_step(found, 100, 0.0).holds  # noqa: E731
+    assert every(none) == ch6_loop._collision(none, 100).holds == "no" and every(none | {(ch6_loop.EVERY, "low"): 100}) == "partly"
+    assert every(few) == "yes" and ch6_loop._zero_mean(few, 100).holds == "no" and ch6_loop._zero_mean(none, 100).holds == "yes"
     safe = few | {(label, "DKF"): 0 for label in ch6_loop.ATTACKS}
     assert ch6_loop._collision(safe, 100).holds == "yes"
 

@@ -5,8 +5,9 @@
     drop the sensor of the largest normalised residual (W r)_i^2 / W_ii, by which g falls; until g <= eta_m for the m that are left
 
 eta_m is the quantile of chi-square with m degrees of freedom that has the same tail as eta has with q. So every test raises a false alarm
-with the same probability while all readings arrive: one that is missing counts as trusted. A single attacked sensor is always found as the smallest set that explains the alarm. For two and more the
-search is greedy (the largest normalised residual test of power-system state estimation, Handschin et al. 1975) and may take one too many.
+with the same probability while all readings arrive: one that is missing counts as trusted. A single attacked sensor is always found as
+the smallest set that explains the alarm. For two and more the search is greedy and may take one too many (the largest normalised residual
+test of power-system state estimation, Handschin et al. 1975).
 With two sensors: g > eta, and the more suspect one is dropped if r_i^2 / S_ii <= eta_1 for the other, else both.
 """
 

@@ -85,10 +85,10 @@ def _denial(seeds: int) -> tuple[Claim, Table, Drawing]:
             "burn-through range [m]": round(Link().burn_through(POWER), 2),
             "readings that are off by more than 5 m": {
                 name: {f"{d:g} m": v for d, v in zip(RANGES, values, strict=True)}
-                for name, values in {**{k: v.tolist() for k, v in share.items()}, f"fills the band, s = {SMALL:g} m^2": small}.items()
+                for name, values in [*((k, v.tolist()) for k, v in share.items()), (f"fills the band, s = {SMALL:g} m^2", small)]
             },
         }, verdict(min(filled) > 0.5, max(filled) < 0.05),
-        "signal path with root-MUSIC, s = 10 m^2 where none is given (the thesis gives none): the ratio is below 1 at all these ranges, but "
+        "signal path with root-MUSIC, s = 10 m^2 where none is given (the thesis has none): the ratio is below 1 at all these ranges, but "
         "IF filter and integration take most of a noise that fills 155 MHz; one that follows the chirp does deny service",
     )  # fmt: skip
     heads = ("range [m]", "Pr/PJ", "noise that fills the band: SNR [dB]", "denied", "noise that follows the chirp: SNR [dB]", "denied")

@@ -38,6 +38,7 @@ ATTACKS = {
     "20 randn m, p = 1": "fdi_gaussian:sd=20.0,targets=[distance]",
     "+8 m/s^2 on car 2's message": "fdi:value=8.0,targets=[predecessor_acceleration]",
 }
+EVERY = "+60 m, p = 1"
 FLIP = 0.25  # change of a share that is one of a verdict
 LAMS = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 STRINGS = (
@@ -75,7 +76,9 @@ def parts(seeds: int, tick: Tick) -> Iterator[Part]:
         rows.append((label, *(f"{_safe(trace)} ({np.median(measure(trace)['min_gap']):.1f} m)" for trace in traces.values())))
     title = f"Runs of {seeds} without a collision (median smallest gap), followers not told u_r"
     yield Table(title, ("attack on car 2 from 20 s", *DEFENCES), tuple(rows))
-    yield from (_collision(safe, seeds), _every_step(scenario, safe, seeds), _zero_mean(safe, seeds))
+    cheap = {what: _play(scenario, LASSO.format(LOW_LAM), ATTACKS[what], seeds) for what in ("no attack", EVERY)}
+    safe[EVERY, "low"] = _safe(cheap[EVERY])
+    yield from (_collision(safe, seeds), _every_step(safe, seeds, _worst(cheap["no attack"])), _zero_mean(safe, seeds))
     tick("closed loop: the leader's input known, and at rest")
     yield from (_known(scenario, safe, seeds), _equilibrium(scenario, seeds))
     tick("closed loop: choice of lam")
@@ -99,16 +102,15 @@ def _collision(safe: Safe, seeds: int) -> Claim:
     )  # fmt: skip
 
 
-def _every_step(scenario: Scenario, safe: Safe, seeds: int) -> Claim:
-    label = "+60 m, p = 1"
-    low = {what: _play(scenario, LASSO.format(LOW_LAM), ATTACKS[what], seeds) for what in ("no attack", label)}
-    count = _safe(low[label])
-    measured: dict[str, Any] = {name: _share(safe[label, name], seeds) for name in DEFENCES}
-    measured[f"lasso, lam = {LOW_LAM:g}"] = _share(count, seeds)
-    measured |= {f"error without an attack, lam = {LOW_LAM:g} [m]": round(_worst(low["no attack"]), 2)}
+def _every_step(safe: Safe, seeds: int, clean: float) -> Claim:
+    """Return the claim at two prices; clean: the error without an attack at the lower one [m]."""
+    low = safe[EVERY, "low"]
+    measured: dict[str, Any] = {name: _share(safe[EVERY, name], seeds) for name in DEFENCES}
+    measured[f"lasso, lam = {LOW_LAM:g}"] = _share(low, seeds)
+    measured[f"error without an attack, lam = {LOW_LAM:g} [m]"] = round(clean, 2)
     return Claim(
         "6.6-every-step", "As the error is bounded (Theorem 6.5.4), the platoon is safe however often the attack comes", "bounded",
-        measured, verdict(safe[label, "lasso"] == seeds, max(safe[label, "lasso"], count) < 0.05 * seeds),
+        measured, verdict(safe[EVERY, "lasso"] == seeds, max(safe[EVERY, "lasso"], low) < 0.05 * seeds),
         f"share of runs without a collision when car 2's distance is 60 m too large in every step, lam = {LOOP_LAM:g} where none is given; "
         "the theorem bounds a step, not their sum, and a lower price trusts no reading much, honest ones included",
     )  # fmt: skip
