@@ -306,3 +306,13 @@ def test_dark_and_light(tab, show):
     show(1280, "dark")
     dark = tab.execute_script(ground)
     assert (light, dark) == ("rgb(255, 255, 255)", "rgb(20, 22, 26)")
+
+
+def test_where_nobody_drives_the_figure_is_the_error(tmp_path):
+    """Ranks and shades follow it, and nothing is said of collisions or metres."""
+    rows = cell("dkf", JAM, 0) + cell("kf", JAM, 0)
+    for row in rows:
+        row |= {"distance_travelled": None, "max_error": 8.0 if row["defence"] == "kf" else 2.0}
+    text = build(rows, tmp_path).read_text(encoding="utf-8")
+    assert re.findall(r"Rank </span>(\d)</span> \D*?\b(d?kf)<", text) == [("1", "dkf"), ("2", "kf")]
+    assert "collision" not in text.split("<main>")[0] and ">8<" in text and 'class="s10"' in text and "Max. error [m]" not in text

@@ -38,7 +38,8 @@ def test_honest_rows_are_verified(rows: list[dict[str, Any]]) -> None:
     report = verify(rows)
     assert report["status"] == "verified" and report["counts"] == {"verified": 18, "differs": 0, "unchecked": 0}
     assert report["entries"] == [{"defence": "kf", "status": "verified", "verified": 18, "differs": 0, "unchecked": 0}]
-    assert report["findings"] == [] and json.loads(json.dumps(report)) == report
+    assert report["findings"] == [] == report["left_out"] and json.loads(json.dumps(report)) == report
+    assert _one(rows, metrics=["mine"], mine=0.5)["left_out"] == ["mine"]
 
 
 @pytest.mark.long

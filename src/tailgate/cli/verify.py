@@ -75,6 +75,8 @@ def _print(report: dict[str, Any]) -> None:
     table(columns, rows, f"{report['status']}: {played}, {report['asked']} asked for{drawn_by(report)}")
     for reason in report["reasons"][:SHOWN]:
         say(f"{reason['rows']} rows {reason['why']}")
+    if report["left_out"]:
+        say(f"not made again, as they are somebody's own metrics: {', '.join(report['left_out'])}")
     wrong = [finding for finding in report["findings"] if finding["verdict"] == "differs"]
     for finding in wrong[:SHOWN]:
         named = f"{finding['scenario']}, {finding['defence']}, {finding['attack']}, dose {finding['dose']}, seed {finding['seed']}"

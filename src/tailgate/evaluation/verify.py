@@ -55,9 +55,11 @@ def verify(
     """Play rows again and compare hashes, metrics and everything else that they record.
 
     `sample`: number of rows, drawn by `sample_seed`; None: all. `batch`: episodes side by side instead of the row's own number, which
-    changes no result. The report has `status`, `counts`, `entries` (the same for each defence), `findings` and `reasons`. The status is
-    "verified" where every row that was asked for agrees, else "claimed". Findings are rows that differ or could not be checked, by
-    line, counted from 1. `submissions`: classes that rows of `leaderboard submit` are about, each in a sandbox, "bwrap/module:Class".
+    changes no result. `submissions`: classes that rows of `leaderboard submit` are about, each in a sandbox, "bwrap/module:Class".
+
+    The report has `status`, `counts`, `entries` (the same for each defence), `findings` and `reasons`. The status is "verified" where every
+    row that was asked for agrees, else "claimed". Findings are rows that differ or could not be checked, by line, counted from 1.
+    `left_out` names columns of somebody's own metrics, which are not made again.
     `files`: the file that each row is from; then the report has the counts of each file too.
     """
     apart = {_target(text): text for text in submissions}
@@ -278,6 +280,7 @@ def _report(rows: Sequence[Row], found: Found, sample: Row, files: Sequence[str]
         "version": VERSION, "engine": ENGINE, "counts": counts(found.values(), VERDICTS),
         "entries": entries(found), "files": [{"file": name, "entries": entries(held)} for name, held in by_file.items()],
         "reasons": [{"why": why, "rows": n} for why, n in reasons.most_common()],
+        "left_out": sorted({name for i in found for name in rows[i].get("metrics", ())}),
         "findings": [
             {"line": i + 1, "verdict": f.verdict, "why": f.why, **{name: rows[i][name] for name in names}, "differences": f.differences}
             for i, f in off.items()

@@ -10,6 +10,7 @@ from typing import Any
 
 from tailgate.base.errors import InputError
 from tailgate.base.files import writable_directory, write_atomic
+from tailgate.board.damage import has_road
 from tailgate.board.entry import reference
 from tailgate.board.schema import Data
 from tailgate.board.words import Name, names_of, percent, shade, spans, steps, ticks
@@ -37,7 +38,8 @@ class _Words:
     attacks: dict[str, Entry]
 
 
-def _cell(entry: Data, words: _Words) -> Data:
+def _cell(entry: Data, words: _Words, most: float | None) -> Data:
+    """Return a cell with its figure: the share of collisions, or the median of the largest error, which is shaded up to `most`."""
     attack = words.attack[entry["attack"]]
     out = entry | {"defence": words.defence[entry["defence"]], "attack": attack, "learned": entry["learned"] or attack.policy}
     crash, failed, reason = entry["crash"], entry["failed"], entry["reason"]
@@ -46,9 +48,14 @@ def _cell(entry: Data, words: _Words) -> Data:
         why = ": ".join(filter(None, (what, reason)))
         return out | {"text": "n/a", "shade": "na", "label": why, "why": why, "lost": True}
     why = f"{failed} more failed: {reason}" if failed else ""
-    low, high = percent(crash["low"]), percent(crash["high"])
-    label = f"95% interval {low} to {high}, {entry['n']} episodes"
-    out |= {"low": low, "high": high, "text": percent(crash["value"]), "shade": shade(crash["value"])}
+    if most is None:
+        low, high = percent(crash["low"]), percent(crash["high"])
+        label = f"95% interval {low} to {high}, {entry['n']} episodes"
+        out |= {"value": crash["value"], "low": low, "high": high, "text": percent(crash["value"]), "shade": shade(crash["value"])}
+    else:
+        value, low, high = (entry["max_error"][key] for key in ("median", "q25", "q75"))
+        label = f"quartiles {low:.4g} to {high:.4g}, {entry['n']} episodes"
+        out |= {"value": value, "text": f"{value:.4g}", "shade": shade(value / most if most > 0.0 else 0.0)}
     out |= {"why": why, "lost": failed > 0}
     return out | {"label": "; ".join(filter(None, (label, why)))}
 
@@ -64,9 +71,9 @@ def _line(text: str, cells: list[Data], uses: set[str], words: _Words) -> Data:
         why = f"incomplete: {lost} {'attack' if lost == 1 else 'attacks'} without full figures"
     if not why and not known:
         why = "no figures"
-    shares = [c["crash"]["value"] for c in known]
-    worst = max(known, key=lambda c: c["crash"]["value"], default=None)
-    order = (bool(why), max(shares, default=2.0), sum(shares) / max(len(shares), 1))
+    values = [c["value"] for c in known]
+    worst = max(known, key=lambda c: c["value"], default=None)
+    order = (bool(why), max(values, default=math.inf), sum(values) / max(len(values), 1))
     return {"name": name, "cells": cells, "why": why, "worst": worst, "known": len(known), "of": len(against), "order": order}
 
 
@@ -80,13 +87,15 @@ def _section(key: tuple[Any, ...], group: Sequence[Data], rows: Sequence[Data], 
             raise InputError(where, [before[differs[0]], e[differs[0]]], "one: a cell of a page has one figure, so build a page of each")
     columns = list(dict.fromkeys((e["attack"], e["knowledge"]) for e in group))
     marks = {c: {k: any(e[k] for e in group if e["attack"] == c[0]) for k in ("learned", "optimal")} for c in columns}
+    road = any(has_road(row) for row in rows if row["status"] == "ok") or not any(row["status"] == "ok" for row in rows)
+    most = None if road else max((e["max_error"]["median"] for e in group if e["crash"]), default=0.0)
     lines = []
     for text in dict.fromkeys(e["defence"] for e in group):
         cells = []
         for column in columns:
             place = {"defence": text, "attack": column[0], "knowledge": column[1]}
             missing = place | {"n": 0, "failed": 0, "reason": "", "crash": None} | marks[column]
-            cells.append(_cell(kept.get((text, *column), missing), words))
+            cells.append(_cell(kept.get((text, *column), missing), words, most))
         uses = {use for row in rows if row["defence"] == text for use in row.get("uses", ())}
         lines.append(_line(text, cells, uses, words))
     lines.sort(key=lambda line: line["order"])
@@ -102,7 +111,7 @@ def _section(key: tuple[Any, ...], group: Sequence[Data], rows: Sequence[Data], 
         heads.append({"name": name, "knowledge": column[1], "about": about, **marks[column], "learned": learned})
     bodies = [("", ranked), ("Unranked, for comparison", [line for line in lines if line["why"]])]
     return {
-        "suite": key[0], "scenario": key[1], "dose": key[2], "heads": heads, "lines": lines,
+        "suite": key[0], "scenario": key[1], "dose": key[2], "heads": heads, "lines": lines, "road": road,
         "bodies": [(title, body) for title, body in bodies if body],
         "n": spans(e["n"] for e in group if e["n"]), "hashes": _distinct(rows, "config_hash"),
     }  # fmt: skip
