@@ -16,7 +16,7 @@ from tailgate.core import Array
 from tailgate.evaluation.paired import Harm
 from tailgate.evaluation.rows import Row
 from tailgate.evaluation.stats import limits
-from tailgate.studies.dose import CRITICAL, critical_dose, fitted
+from tailgate.studies.dose import CRITICAL, critical_dose, crossing, fitted
 
 from .damage import MISSING, PLAYED, Key, Table, damaged
 from .schema import Data
@@ -177,11 +177,8 @@ class Worst:
         first = len(self.points) - len(doses)  # below the smallest dose nothing was played: a line down to no attack would be a guess
         line = fitted(np.array([point["value"] for point in self.points]))
         low, high = np.array([self.bounds(dose, sides=2 * len(doses)) for dose in self.numbers]).T
-        found = {
-            "value": critical_dose(doses, line[first:], CRITICAL),
-            "low": critical_dose(doses, np.minimum.accumulate(high[::-1])[::-1], CRITICAL),  # damage only rises with the dose
-            "high": critical_dose(doses, np.maximum.accumulate(low), CRITICAL),
-        }
+        ends = crossing(doses, low, high, CRITICAL)
+        found = {"value": critical_dose(doses, line[first:], CRITICAL), "low": ends[0], "high": ends[1]}
         if line[:first].max(initial=0.0) > CRITICAL:
             found = dict.fromkeys(found, 0.0)
         at = next((point for point in self.points if point["value"] > CRITICAL), self.points[-1])

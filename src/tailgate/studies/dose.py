@@ -1,8 +1,9 @@
 """Dose-response: how much damage an attack does with how many steps, and the dose at which it becomes critical.
 
 The curve is a monotone (isotonic) regression of the measured means, as a larger budget can be left unspent. The critical dose is where the
-curve, straight between two measured doses, first exceeds the limit. Its interval is a percentile bootstrap over episodes, the same for
-every dose. It does not cover the course of the curve between two doses that lie far apart.
+curve, straight between two measured doses, first exceeds the limit. Its interval is where limits that hold for all doses together cross it:
+of shares those of Clopper and Pearson. A bootstrap would have no width where no episode was damaged. The interval of means is a percentile
+bootstrap over episodes, the same for every dose. No interval covers the course of the curve between two doses that lie far apart.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_scenario
 from tailgate.core.schema import as_data
 from tailgate.evaluation.cells import Cell, cells_of, run
+from tailgate.evaluation.stats import limits
 from tailgate.play.metrics import unit_in
 
 from .policies import check_episodes, is_policy, is_share, mean, misfit, outcome_for
@@ -48,15 +50,30 @@ def critical_dose(doses: Array, curve: Array, limit: float) -> float:
     return float(doses[i - 1] + rise * (doses[i] - doses[i - 1]))
 
 
-def critical_interval(doses: Array, outcomes: Array, limit: float, seed: int = 0) -> tuple[float, float]:
-    """Return interval of the critical dose from outcomes (doses, episodes); inf where it lies beyond the largest dose."""
+def crossing(doses: Array, low: Array, high: Array, limit: float) -> tuple[float, float]:
+    """Return the interval of the critical dose from limits (doses,) of the damage, which only rises with the dose."""
+    rising = np.minimum.accumulate(high[::-1])[::-1], np.maximum.accumulate(low)
+    first, last = (critical_dose(doses, curve, limit) for curve in rising)
+    return first, last
+
+
+def critical_interval(doses: Array, outcomes: Array, limit: float, share: bool, seed: int = 0) -> tuple[float, float]:
+    """Return the interval of the critical dose from outcomes (doses, episodes); inf where it lies beyond the largest dose.
+
+    share: they are 0 or 1.
+    """
+    if share:
+        hits, n = outcomes.sum(axis=1), np.full(len(doses), outcomes.shape[1])
+        low, high = crossing(doses, *limits(hits, n, (1 - LEVEL) / (2 * len(doses))), limit)
+        value = critical_dose(doses, fitted(outcomes.mean(axis=1)), limit)  # which the regression may put outside
+        return min(low, value), max(high, value)
     rng = np.random.default_rng(seed)
     episodes = outcomes.shape[1]
     found = np.sort([
         critical_dose(doses, fitted(outcomes[:, rng.integers(episodes, size=episodes)].mean(axis=1)), limit) for _ in range(RESAMPLES)
     ])  # fmt: skip
-    low, high = math.floor((1 - LEVEL) / 2 * (RESAMPLES - 1)), math.ceil((1 + LEVEL) / 2 * (RESAMPLES - 1))
-    return float(found[low]), float(found[high])
+    ends = math.floor((1 - LEVEL) / 2 * (RESAMPLES - 1)), math.ceil((1 + LEVEL) / 2 * (RESAMPLES - 1))
+    return float(found[ends[0]]), float(found[ends[1]])
 
 
 def dose_response(
@@ -131,6 +148,6 @@ def _curve(
     out = head | {"points": points, "attack_steps": spent}
     if limit is None:
         return out
-    low, high = critical_interval(at, values, limit)
+    low, high = critical_interval(at, values, limit, is_share(unit))
     named = {"value": critical_dose(at, curve, limit), "low": low, "high": high}
     return out | {"critical_dose": {key: value if math.isfinite(value) else None for key, value in named.items()}}
