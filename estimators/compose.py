@@ -19,7 +19,7 @@ from tailgate.core import Array, Count, Estimate, Innovation, Mode, Model, NonNe
 from tailgate.core.draws import Draws
 from tailgate.core.registry import PARTS, Family, imported, make_from, register
 from tailgate.core.schema import build, fields_of
-from tailgate.estimators.parts import Decision, Detector, Filter, Mitigation, Stateless, Verdict, blame_all
+from tailgate.estimators.parts import Decision, Detector, Filter, Mitigation, Stateless, Verdict, blame_all, normalised
 
 FP = TypeVar("FP", default=Any)  # the filter's plan
 FS = TypeVar("FS", default=Any)  # and state
@@ -180,7 +180,7 @@ class Score(Stateless):
     """The normalised innovation squared r' S^-1 r as a score; never alarms."""
 
     def step(self, plan: None, state: None, innovation: Innovation) -> tuple[None, Verdict]:
-        score = num.quadratic(innovation.r, num.inverse(innovation.S))
+        score = normalised(innovation)
         return None, blame_all(score, np.zeros_like(score, bool), innovation)
 
     def gate(self, plan: None, state: None) -> None:

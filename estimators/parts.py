@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from tailgate import num
 from tailgate.core import Array, Innovation, Model, Prior, Received
 from tailgate.core.nouns import P, S
 
@@ -112,6 +113,11 @@ class Stateless(Memoryless):
 
     def prepare(self, model: Model) -> None:
         return None
+
+
+def normalised(innovation: Innovation) -> Array:
+    """Return the normalised innovation squared r' S^-1 r (B, N)."""
+    return num.quadratic(innovation.r, num.inverse(innovation.S))
 
 
 def blame_all(score: Array, alarm: Array, innovation: Innovation) -> Verdict:

@@ -30,7 +30,7 @@ from tailgate.core.registry import register
 from tailgate.envs.sensors.fmcw import false_alarm_threshold, from_db
 from tailgate.estimators.compose import AcceptAll, Look, ModeName, ReactionPlan, ReactionState, part_from
 from tailgate.estimators.filters.predictors import read_states
-from tailgate.estimators.parts import Filter, Verdict
+from tailgate.estimators.parts import Filter, Verdict, normalised
 
 Chance = Annotated[float, Field(gt=0, lt=1)]
 Steps = tuple[PositiveCount, ...]
@@ -157,7 +157,7 @@ class Challenger:
         reaction, decision = plan.reaction.step(plan.reaction_plan, state.reaction, verdict, received)
         probe = ~self._due(plan, state.k + 2, alarm, draws)
         if self.suspicion is not None:
-            odd = num.quadratic(innovation.r, num.inverse(innovation.S)) > self.suspicion
+            odd = normalised(innovation) > self.suspicion
             probe &= ~(odd & ~muted)
         return ChallengeState(live, safe, reaction, state.k + 1, probe, heard, owed), Estimate(x, heard, alarm, decision.mode, probe)
 

@@ -10,12 +10,11 @@ A shut gate widens with P, and so re-opens in time. With the steady gain it does
 from dataclasses import dataclass
 from typing import ClassVar
 
-from tailgate import num
 from tailgate.core import Innovation, Positive, param
 from tailgate.core.registry import register
 from tailgate.estimators.compose import Composed, GateOut
 from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanFilter
-from tailgate.estimators.parts import Detector, Filter, Mitigation, Stateless, Verdict, blame_all
+from tailgate.estimators.parts import Detector, Filter, Mitigation, Stateless, Verdict, blame_all, normalised
 
 
 @register("detector", "chi2", reference="Dutta 2018, section 4.2")
@@ -27,7 +26,7 @@ class ChiSquare(Stateless):
     eta: Positive = param(20.0, "threshold on r' S^-1 r [-]")
 
     def step(self, plan: None, state: None, innovation: Innovation) -> tuple[None, Verdict]:
-        score = num.quadratic(innovation.r, num.inverse(innovation.S))
+        score = normalised(innovation)
         return None, blame_all(score, score > self.eta, innovation)
 
     def gate(self, plan: None, state: None) -> float:

@@ -19,7 +19,7 @@ from pydantic import Field
 from tailgate import num
 from tailgate.core import Array, Innovation, Model, Positive, PositiveCount, param
 from tailgate.core.registry import register
-from tailgate.estimators.parts import Verdict, blame_all
+from tailgate.estimators.parts import Verdict, blame_all, normalised
 
 Allowance = Annotated[float, Field(gt=1, le=1e30, allow_inf_nan=False)]
 Weight = Annotated[float, Field(ge=1e-6, le=1)]
@@ -47,11 +47,6 @@ def whiten(innovation: Innovation) -> Array:
             part = part - L[i][k] * out[k]
         out.append(part / L[i][i])
     return num.stack(out)
-
-
-def normalised(innovation: Innovation) -> Array:
-    """Return g = r' S^-1 r (B, N)."""
-    return num.quadratic(innovation.r, num.inverse(innovation.S))
 
 
 class WindowState(NamedTuple):

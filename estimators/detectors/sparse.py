@@ -21,7 +21,7 @@ from tailgate.core import Array, Innovation, Model, Positive, param
 from tailgate.core.registry import register
 from tailgate.estimators.compose import Composed, GateOut
 from tailgate.estimators.filters.kalman import KalmanFilter, alone
-from tailgate.estimators.parts import Detector, Filter, Memoryless, Mitigation, Verdict
+from tailgate.estimators.parts import Detector, Filter, Memoryless, Mitigation, Verdict, normalised
 
 
 @register("detector", "sparse_chi2", reference="Dutta 2018, section 4.7; Handschin, Schweppe, Kohlas and Fiechter 1975")
@@ -42,7 +42,7 @@ class SparseChiSquare(Memoryless):
         return np.array([0.0, *fewer, self.eta])
 
     def step(self, plan: Array, state: None, innovation: Innovation) -> tuple[None, Verdict]:
-        score = num.quadratic(innovation.r, num.inverse(innovation.S))
+        score = normalised(innovation)
         alarm = score > self.eta
         suspect = np.zeros(innovation.r.shape, bool)
         if num.some(alarm):

@@ -28,7 +28,7 @@ from tailgate.core.registry import register
 from tailgate.estimators.compose import AcceptAll, Composed, GateOut, Score
 from tailgate.estimators.detectors.chi_square import ChiSquare
 from tailgate.estimators.filters.kalman import GAIN, Gain, KalmanState, LinearFilter, alone, broad, gain_of, precision, riccati, updated
-from tailgate.estimators.parts import Detector, Filter, Memoryless, Mitigation, Verdict, blame_all
+from tailgate.estimators.parts import Detector, Filter, Memoryless, Mitigation, Verdict, blame_all, normalised
 
 SWEEPS = 200
 SETTLED = 1e-13  # relative
@@ -319,7 +319,7 @@ class TailChiSquare(Memoryless):
         return float(special.chdtri(len(model.sensors), self.tail))
 
     def step(self, plan: float, state: None, innovation: Innovation) -> tuple[None, Verdict]:
-        score = num.quadratic(innovation.r, num.inverse(innovation.S))
+        score = normalised(innovation)
         return None, blame_all(score, score > plan, innovation)
 
     def gate(self, plan: float, state: None) -> float:

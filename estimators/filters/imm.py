@@ -102,19 +102,19 @@ def mix(state: ImmState, moves: Array) -> list[tuple[KalmanState, Array]]:
     out = []
     for j in range(len(state.models)):
         parts = [moves[i, j] * state.mu[..., i] for i in range(len(state.models))]
-        c = _total(parts)
+        c = summed(parts)
         w = [part / c for part in parts]
-        x = _total([w[i][..., None] * m.x for i, m in enumerate(state.models)])
+        x = summed([w[i][..., None] * m.x for i, m in enumerate(state.models)])
         out.append((KalmanState(x, _spread(w, [m.P for m in state.models], [m.x - x for m in state.models])), c))
     return out
 
 
 def merged(held: Sequence[KalmanState], weights: Sequence[Array]) -> KalmanState:
     """Return the Gaussian with mean and covariance of a mixture of weights (B, N), up to a factor; the first alone where all are 0."""
-    total = _total(weights)
+    total = summed(weights)
     some = total > 0.0
     w = [np.where(some, part / np.where(some, total, 1.0), 1.0 if j == 0 else 0.0) for j, part in enumerate(weights)]
-    x = _total([part[..., None] * one.x for part, one in zip(w, held, strict=True)])
+    x = summed([part[..., None] * one.x for part, one in zip(w, held, strict=True)])
     return KalmanState(x, _spread(w, [one.P for one in held], [one.x - x for one in held]))
 
 
@@ -122,7 +122,7 @@ def _spread(w: Sequence[Array], P: Sequence[Any], off: Sequence[Array]) -> Array
     """Return sum_i w_i (P_i + off_i off_i') (B, N, n, n)."""
     if off[0].shape[-1] > SMALL:
         return num.moment(w, P, off)
-    return _total([a[..., None, None] * (p + d[..., :, None] * d[..., None, :]) for a, p, d in zip(w, P, off, strict=True)])
+    return summed([a[..., None, None] * (p + d[..., :, None] * d[..., None, :]) for a, p, d in zip(w, P, off, strict=True)])
 
 
 def log_likelihood(innovation: Innovation, valid: Array) -> Array:
@@ -144,23 +144,24 @@ def weigh(logs: Sequence[Array]) -> tuple[Array, Array]:
     for log in logs[1:]:
         largest = np.maximum(largest, log)
     weights = [np.maximum(num.exp(log - largest), LEAST) for log in logs]
-    total = _total(weights)
+    total = summed(weights)
     if len(logs) == 1:
         return num.stack([weights[0] / total]), np.zeros_like(total)
     other = logs[1]
     for log in logs[2:]:
         other = np.maximum(other, log)
-    odds = other + num.log(_total([num.exp(log - other) for log in logs[1:]])) - logs[0]
+    odds = other + num.log(summed([num.exp(log - other) for log in logs[1:]])) - logs[0]
     return num.stack([w / total for w in weights]), odds
 
 
 def combine(columns: Sequence[Array], mu: Array) -> Array:
     """Return sum_j mu_j x_j (B, N, n)."""
-    return _total([mu[..., j, None] * x for j, x in enumerate(columns)])
+    return summed([mu[..., j, None] * x for j, x in enumerate(columns)])
 
 
-def _total(terms: Sequence[Any]) -> Array:
+def summed(terms: Sequence[Array]) -> Array:
+    """Return the sum in the order of the terms."""
     out = terms[0]
     for term in terms[1:]:
         out = out + term
-    return np.asarray(out)
+    return out

@@ -7,14 +7,13 @@ Reduced after Vo and Ma (2006): the heaviest component takes in all whose mean i
 so that mean and covariance stay; then the heaviest of those that are left, J times. Lighter ones than `prune` are left out.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from tailgate import num
 from tailgate.core import Array, Received
-from tailgate.estimators.filters.imm import LEAST, log_likelihood, merged
+from tailgate.estimators.filters.imm import LEAST, log_likelihood, merged, summed
 from tailgate.estimators.filters.kalman import KalmanFilter, KalmanPlan, KalmanState
 
 
@@ -41,14 +40,6 @@ def component(held: Mixture, k: int) -> KalmanState:
     return KalmanState(held.x[:, :, k], held.P[:, :, k])
 
 
-def total(terms: Sequence[Array]) -> Array:
-    """Return the sum in the order of the terms."""
-    out = terms[0]
-    for term in terms[1:]:
-        out = out + term
-    return out
-
-
 def weights(held: Mixture) -> list[Array]:
     """Return the weight (B, N) of each component."""
     return [held.w[..., k] for k in range(held.w.shape[-1])]
@@ -57,7 +48,7 @@ def weights(held: Mixture) -> list[Array]:
 def joined(one: Mixture, other: Mixture, share: Array, rest: Array) -> Mixture:
     """Return `one` and `other` with their weights times share and rest (B, N), scaled to 1; `one` alone where both are 0."""
     parts = [share * w for w in weights(one)] + [rest * w for w in weights(other)]
-    whole = total(parts)
+    whole = summed(parts)
     some = whole > 0.0
     kept = weights(one) + [num.zeros(whole.shape)] * len(weights(other))
     w = [np.where(some, part / np.where(some, whole, 1.0), old) for part, old in zip(parts, kept, strict=True)]
@@ -90,7 +81,7 @@ def measured(plan: KalmanPlan, held: Mixture, received: Received, known_u: Array
     for term in terms[1:]:
         largest = np.maximum(largest, term)
     parts = [num.exp(term - largest) for term in terms]
-    whole = total(parts)
+    whole = summed(parts)
     out = Mixture(
         num.stack([part / whole for part in parts]), belief.x.reshape(batch, agents, K, n), belief.P.reshape(batch, agents, K, n, n)
     )
@@ -106,15 +97,15 @@ def reduced(held: Mixture, places: int, merge: float, prune: float) -> Mixture:
     found, shares = [], []
     for _ in range(places):
         best = np.argmax(num.stack(left), axis=-1)  # the first of equals
-        centre = total([np.where((best == k)[..., None], part.x, 0.0) for k, part in enumerate(parts)])
+        centre = summed([np.where((best == k)[..., None], part.x, 0.0) for k, part in enumerate(parts)])
         taken = []
         for k, part in enumerate(parts):
             near = (num.quadratic(part.x - centre, inverses[k]) <= merge) | (best == k)
             taken.append(np.where(near, left[k], 0.0))
             left[k] = np.where(near, 0.0, left[k])
         found.append(merged(parts, taken))
-        shares.append(total(taken))
-    whole = total(shares)
+        shares.append(summed(taken))
+    whole = summed(shares)
     w = num.stack([share / whole for share in shares])
     stacked = [np.concatenate([leaf[:, :, None] for leaf in leaves], axis=2) for leaves in zip(*((s.x, s.P) for s in found), strict=True)]
     return Mixture(w, stacked[0], stacked[1])
@@ -122,4 +113,4 @@ def reduced(held: Mixture, places: int, merge: float, prune: float) -> Mixture:
 
 def mean(held: Mixture) -> Array:
     """Return the mean (B, N, n)."""
-    return total([w[..., None] * held.x[:, :, k] for k, w in enumerate(weights(held))])
+    return summed([w[..., None] * held.x[:, :, k] for k, w in enumerate(weights(held))])

@@ -24,7 +24,7 @@ from tailgate.core.registry import register
 from tailgate.estimators.compose import AcceptAll, Composed
 from tailgate.estimators.detectors.chi_square import ChiSquare
 from tailgate.estimators.filters.kalman import KalmanPlan, KalmanState, LinearFilter, alone, kalman_plan, steady_state
-from tailgate.estimators.parts import Detector, Filter, Memoryless, Mitigation, Verdict
+from tailgate.estimators.parts import Detector, Filter, Memoryless, Mitigation, Verdict, normalised
 
 ROUNDS = 1000  # far above what was ever seen: a guard against rounding
 ACCURACY = 1e-9  # asked of the interior-point solver
@@ -236,7 +236,7 @@ class Outlier(Penalty, Memoryless):
     def step(self, plan: Array, state: None, innovation: Innovation) -> tuple[None, Verdict]:
         r, S = innovation
         suspect = believed(r, S, self.price(S)) != r
-        return None, Verdict(num.quadratic(r, num.inverse(S)), suspect.any(axis=-1), suspect)
+        return None, Verdict(normalised(innovation), suspect.any(axis=-1), suspect)
 
     def gate(self, plan: Array, state: None) -> Array:
         """Return the largest ellipsoid r' S^-1 r inside |2 S^-1 r|_i <= lam_i, for the steady S.

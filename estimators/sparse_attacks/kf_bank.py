@@ -19,8 +19,7 @@ from tailgate import num
 from tailgate.core import Array, Count, Estimate, Innovation, Mode, Model, Positive, PositiveCount, Prior, Received, param
 from tailgate.core.draws import Draws
 from tailgate.core.registry import register
-from tailgate.estimators.detectors.sequential import normalised
-from tailgate.estimators.parts import Verdict, blame_all
+from tailgate.estimators.parts import Verdict, blame_all, normalised
 from tailgate.estimators.sparse_attacks.bank import BankPlan, bank_plan, bank_start, bank_step, statistic
 from tailgate.estimators.sparse_attacks.subsets import require, without
 

@@ -102,8 +102,8 @@ def check(
     files = {attack.attack: attack.digest for attack in board.attacks}
     seen = again(asked, lambda i: _cell(board.cells[i], board, suite), play, lambda i, here: _compared(board.cells[i], here, files))
     off = strays(data, suite) + undue(data, suite, listed)
-    listed = {(stray["defence"], stray["field"]) for stray in off}
-    off += [stray for stray in _scored(data, held, suite) if (stray["defence"], stray["field"]) not in listed]
+    named = {(stray["defence"], stray["field"]) for stray in off}
+    off += [stray for stray in _scored(data, held, suite) if (stray["defence"], stray["field"]) not in named]
     more = {"strays": off, "untold": untold(data, suite), "scored": bool(held)}
     return _report(board, seen, sampling(sample, sample_seed)) | more
 
