@@ -12,7 +12,8 @@ from tailgate.core.draws import keys
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
 from tailgate.envs.controllers.cacc import no_gains
-from tailgate.envs.plants.platoon import Platoon, closed_loop, hold
+from tailgate.envs.plants.platoon import Platoon, closed_loop
+from tailgate.envs.plants.sampled import zero_order_hold
 from tailgate.envs.plants.sensor_network import LinearSensors, NoControl, SensorNetwork
 from tailgate.estimators import DistributedKalman, DistributedKalmanFilter, Kalman
 from tailgate.estimators.distributed.distributed_kalman import fixed_point, neighbours
@@ -280,7 +281,8 @@ def test_a_chain_is_blind_upstream_only():
 def test_the_open_loop_platoon_as_printed_is_refused(name):
     """Without the feedback every gap is an integrator that only those behind can know: all but the last car are named."""
     model = load_scenario(name).brief().model
-    A, _, _ = hold(*closed_loop(no_gains(model.agents, 3.0), 1.008), model.dt)
+    A, B, _ = closed_loop(no_gains(model.agents, 3.0), 1.008)
+    A, _ = zero_order_hold(A, B[:, None], model.dt)
     with pytest.raises(InputError, match="'0, 1, 2, 3'"):
         DistributedKalman().prepare(dataclasses.replace(model, A=A))
     DistributedKalman().prepare(model)

@@ -14,7 +14,8 @@ from tailgate.core.draws import Role, keys
 from tailgate.core.registry import make
 from tailgate.core.scenario import list_scenarios, load_scenario
 from tailgate.envs.controllers.cacc import PER_CAR, Column
-from tailgate.envs.plants.platoon import Platoon, PlatoonSensors, closed_loop, hold
+from tailgate.envs.plants.platoon import Platoon, PlatoonSensors, closed_loop
+from tailgate.envs.plants.sampled import zero_order_hold
 from tailgate.envs.vehicle import lag
 from tailgate.play.trace import rollout
 
@@ -94,7 +95,8 @@ def test_the_hold_is_exact(name):
     """Ad, Bd and cd equal scipy's matrix exponential, the constant being an input that is 1."""
     A, B, c = closed_loop(law_of(name).gains(Platoon().hears(), 3.0), 1.008)
     for dt in (0.01, 0.1, 1.0, 5.0):
-        Ad, Bd, cd = hold(A, B, c, dt)
+        Ad, inputs = zero_order_hold(A, np.stack([B, c], axis=1), dt)
+        Bd, cd = inputs.T
         want = cont2discrete((A, np.stack([B, c], axis=1), np.eye(len(A)), np.zeros((len(A), 2))), dt, "zoh")
         np.testing.assert_allclose(Ad, expm(A * dt), rtol=1e-11, atol=1e-12)
         np.testing.assert_allclose(np.stack([Bd, cd], axis=1), want[1], rtol=1e-11, atol=1e-11)

@@ -27,6 +27,7 @@ from tailgate.core.quantities import Gap, Positive, PositiveSpeed, Spread, Step,
 from tailgate.core.registry import register
 from tailgate.envs.controllers.lane_lqr import CURVATURE, STEERING
 from tailgate.envs.controllers.lane_stanley import LaneStanley
+from tailgate.envs.plants.sampled import zero_order_hold
 from tailgate.envs.vehicle import SIGMAS
 
 STATES = 4
@@ -65,15 +66,6 @@ def bicycle(mass: float, inertia: float, front: float, rear: float, front_stiffn
     ])  # fmt: skip
     bend = [0.0, -turn / (mass * speed) - speed, 0.0, -damp / (inertia * speed)]
     return A, np.array([[0.0, 0.0], [cf / mass, bend[1] * speed], [0.0, 0.0], [cf * front / inertia, bend[3] * speed]])
-
-
-def held(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
-    """Return the matrices of a step dt [s] of x' = A x + B u, with u held over it."""
-    n, m = B.shape
-    whole = np.zeros((n + m, n + m))
-    whole[:n, :n], whole[:n, n:] = A * dt, B * dt
-    step = num.expm(whole)
-    return step[:n, :n], step[:n, n:]
 
 
 class LanePlan(NamedTuple):
@@ -128,7 +120,7 @@ class LaneKeeping:
         A, B = bicycle(
             self.mass, self.inertia, self.front, self.rear, self.front_stiffness, self.rear_stiffness, self.lane_speed
         )
-        return held(A, B, self.dt)
+        return zero_order_hold(A, B, self.dt)
 
     def model(self, sensor: Sensor, controller: Controller) -> Model:
         """Return the public model. Raise InputError for a controller that reckons with another car."""

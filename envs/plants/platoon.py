@@ -26,6 +26,7 @@ from tailgate.core.quantities import Gap, Lag, Length, PositiveSpread, PositiveV
 from tailgate.core.reach import require_detectable
 from tailgate.core.registry import register
 from tailgate.envs.controllers.cacc import PER_CAR, V2V, Column, Gains, Law
+from tailgate.envs.plants.sampled import zero_order_hold
 from tailgate.envs.vehicle import SIGMAS, drive, lag
 
 GEARED = ("distance", "velocity")  # wires of the spacing error and of its rate
@@ -70,15 +71,6 @@ def closed_loop(gains: Gains, tau: float) -> tuple[Array, Array, Array]:
         c[f] = (gains.g0[i] + V[2] * gains.k0[i - 1]) / gains.tau_f
         B[f] = V[2] / gains.tau_f if i == 1 else 0.0
     return A, B, c
-
-
-def hold(A: Array, B: Array, c: Array, dt: float) -> tuple[Array, Array, Array]:
-    """Return the zero-order hold of x' = A x + B u + c for a step dt: Ad (n, n), Bd (n,), cd (n,)."""
-    n = len(A)
-    whole = np.zeros((n + 2, n + 2))
-    whole[:n, :n], whole[:n, n], whole[:n, n + 1] = A * dt, B * dt, c * dt
-    out = num.expm(whole)
-    return out[:n, :n], out[:n, n], out[:n, n + 1]
 
 
 @dataclass(frozen=True)
@@ -130,7 +122,8 @@ class String:
     def model(self, sensor: Sensor, controller: Controller) -> Model:
         """Return the public model: the closed loop. Raise InputError, naming the cars, where it is not detectable."""
         (cars, n), (names, C, R) = self.size, sensor.matrices(self)
-        A, B, c = hold(*closed_loop(self.gains(controller), self.tau), self.dt)
+        A, B, c = closed_loop(self.gains(controller), self.tau)
+        A, inputs = zero_order_hold(A, np.stack([B, c], axis=1), self.dt)
         told, gap, speed = np.full(n, self.process_var), np.zeros((cars, n)), np.zeros((cars, n))
         for i in range(cars):
             told[Column.accel(i)] = self.accel_sd * self.accel_sd
@@ -138,7 +131,7 @@ class String:
             if i:
                 gap[i, Column.gap(i)] = 1.0
         model = Model(
-            A=A, B=B[:, None], c=c, C=C, Q=np.diag(told), R=R, graph=self.hears(), dt=self.dt, sensors=names, v2v=V2V,
+            A=A, B=inputs[:, :1], c=inputs[:, 1], C=C, Q=np.diag(told), R=R, graph=self.hears(), dt=self.dt, sensors=names, v2v=V2V,
             actuators=("command",), gap=gap, speed=speed,
         )  # fmt: skip
         require_detectable(model, "plant platoon")
