@@ -1,4 +1,4 @@
-"""Make a board whose searches take longer than one sitting. Finished searches stay in results/under-way, and the next sitting goes on.
+"""Make a board whose searches take longer than one sitting. Searches stay in results/under-way, and the next sitting goes on.
 
     python benchmarks/board_in_parts.py road-v0 [--hours 2] [--workers 2] [--defence NAME]
 
@@ -17,11 +17,12 @@ import subprocess
 import sys
 import tarfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 FILES = "policy:path=", "program:path="  # attacks that lie in files
+BEGUN = ".begun.tar.xz"  # how the archives of unfinished searches end
 PAUSE, PATIENCE = 20, 300  # seconds between two looks for finished searches, and for the end of a sitting
 
 
@@ -49,7 +50,8 @@ def main() -> int:
     until = time.monotonic() + 3600 * options.hours
     for part in parts or [whole]:
         sit([sys.executable, "-m", "tailgate", "leaderboard", *part, "--workers", str(options.workers)], tree, options.suite, kept, until)
-    print(f"{len(list(kept.glob('*.tar.xz')))} searches in {kept.relative_to(ROOT)}")
+    begun = len(list(kept.glob(f"*{BEGUN}")))
+    print(f"{len(list(kept.glob('*.tar.xz'))) - begun} searches in {kept.relative_to(ROOT)}, and {begun} that were begun")
     return 0
 
 
@@ -70,6 +72,7 @@ def sit(command: list[str], tree: Path, suite: str, kept: Path, until: float) ->
         except subprocess.TimeoutExpired:
             run.kill()
         keep(tree, suite, kept)
+        keep_begun(tree, suite, kept)
 
 
 def commit_of(kept: Path) -> str:
@@ -87,13 +90,27 @@ def keep(tree: Path, suite: str, kept: Path) -> None:
     """Pack each finished search with the files of its attacks."""
     for result in sorted(tree.glob(f"results/{suite}/attacked/searches/*/searches/*.json")):
         packed = kept / f"{result.parents[1].name}-{result.stem}.tar.xz"
-        if packed.exists():
+        if not packed.exists():
+            pack(packed, tree, [result.relative_to(tree), *files_of(json.loads(result.read_text()), tree)])
+            packed.with_name(f"{packed.name.removesuffix('.tar.xz')}{BEGUN}").unlink(missing_ok=True)
+
+
+def keep_begun(tree: Path, suite: str, kept: Path) -> None:
+    """Pack what a sitting that ends has of its searches: the journal of each, and the files of the attacks that it has found."""
+    for journal in sorted(tree.glob(f"results/{suite}/attacked/searches/*/searches/*.journal")):
+        if journal.with_suffix(".json").exists():
             continue
-        partial = packed.with_suffix(".part")
-        with tarfile.open(partial, "w:xz") as out:
-            for path in (result.relative_to(tree), *files_of(json.loads(result.read_text()), tree)):
-                out.add(tree / path, str(path), filter=plain)
-        partial.replace(packed)
+        found = sorted(path for path in (journal.parents[1] / "attacks" / journal.stem).rglob("*") if path.is_file())
+        pack(kept / f"{journal.parents[1].name}-{journal.stem}{BEGUN}", tree, [path.relative_to(tree) for path in (journal, *found)])
+
+
+def pack(packed: Path, tree: Path, paths: Iterable[Path]) -> None:
+    """Write an archive of files of the work tree in one step."""
+    partial = packed.with_suffix(".part")
+    with tarfile.open(partial, "w:xz") as out:
+        for path in paths:
+            out.add(tree / path, str(path), filter=plain)
+    partial.replace(packed)
 
 
 def files_of(found: dict[str, list[dict[str, list[dict[str, str]]]]], tree: Path) -> Iterator[Path]:

@@ -44,6 +44,27 @@ def test_a_finished_search_is_kept_with_its_files(parts, tmp_path):
     assert {str(path.relative_to(tmp_path / "again")): path.read_text() for path in (tmp_path / "again").rglob("*.*")} == texts
 
 
+def test_a_search_that_was_begun_is_kept_until_it_is_finished(parts, tmp_path):
+    """Its journal, and the attacks that it has found so far."""
+    tree, kept = tmp_path / "tree", tmp_path / "kept"
+    kept.mkdir()
+    place = Path("results/s/attacked/searches/kf")
+    texts = {f"{place}/searches/two-20.journal": "half a search", f"{place}/attacks/two-20/programs/a.yaml": "program"}
+    for name, text in texts.items():
+        (tree / name).parent.mkdir(parents=True, exist_ok=True)
+        (tree / name).write_text(text)
+    parts.keep_begun(tree, "s", kept)
+    (packed,) = kept.iterdir()
+    with tarfile.open(packed) as held:
+        held.extractall(tmp_path / "again", filter="data")
+    assert packed.name == "kf-two-20.begun.tar.xz"
+    assert {str(path.relative_to(tmp_path / "again")): path.read_text() for path in (tmp_path / "again").rglob("*.*")} == texts
+    (tree / place / "searches" / "two-20.json").write_text(json.dumps({"members": []}))
+    parts.keep(tree, "s", kept)
+    parts.keep_begun(tree, "s", kept)
+    assert [path.name for path in kept.iterdir()] == ["kf-two-20.tar.xz"]
+
+
 def test_searches_belong_to_the_commit_of_the_first_sitting(parts, tmp_path):
     def git(*words):
         return subprocess.run(["git", "-c", "user.name=a", "-c", "user.email=a@b", *words], cwd=tmp_path, check=True, capture_output=True, text=True).stdout.strip()
