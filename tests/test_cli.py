@@ -153,7 +153,7 @@ REPORT: dict[str, Any] = {"threat": {"budget": 4}, "outcome": "crashed", "unit":
 
 
 @pytest.mark.parametrize(("gain", "words"), [
-    ((0.0, -0.01, 0.01), "+0.0 points, 95 % interval -1.0 to +1.0 (equal)"), ((0.01, -0.01, 0.03), "(undecided)"), ((0.5, 0.4, 0.6), "(wins)"),
+    ((0.0, -0.01, 0.01), "+0.0 points, 95 % interval -1.0 to +1.0 (undecided)"), ((0.01, -0.01, 0.03), "(undecided)"), ((0.5, 0.4, 0.6), "(wins)"),
     ((-0.5, -0.6, -0.4), "(loses)"),
 ])  # fmt: skip
 def test_a_verdict_on_a_policy(gain: tuple[float, float, float], words: str, capsys: pytest.CaptureFixture[str]) -> None:

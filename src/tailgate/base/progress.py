@@ -72,7 +72,7 @@ def progress(shown_on: Console) -> Iterator[Update]:
 def lasting(seconds: float) -> str:
     """Return a time as people say it."""
     unit, name = next((u, n) for u, n in ((3600.0, "h"), (60.0, "min"), (1.0, "s")) if seconds >= 2 * u or u == 1.0)
-    return f"{seconds / unit:.2g} {name}" if seconds < 100 * unit else f"{seconds / unit:.0f} {name}"
+    return f"{seconds / unit:.2g} {name}" if seconds < 99.5 * unit else f"{seconds / unit:.0f} {name}"
 
 
 def cells(done: int, total: int) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import os
 import re
 import shutil
 import sys
@@ -25,6 +26,8 @@ from tailgate.cli.completion import complete
 from tailgate.cli.examples import EXAMPLES, GROUPS
 
 EXIT_INPUT = 2
+WRITTEN = ("out", "plot", "parquet", "video")  # options that name something to write
+OVERRIDE = re.compile(r"[A-Za-z_][\w.]*=")  # the beginning of key=value
 CHOICE, OPTION = 0.6, 0.75  # likeness from which a name is suggested; options have their dashes in common
 COMMANDS = (
     "train", "tune", "selfplay", "ensemble", "distil", "evaluate", "timing", "dose", "transfer", "zoo", "calibrate", "learn_envelope",
@@ -35,6 +38,9 @@ COMMANDS = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code: 0 done, 1 a component failed, 2 bad input, 130 interrupted, 143 terminated."""
     complete(_parser)
+    for name in ("stdout", "stderr"):  # closed by the shell, as by >&-
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115 - until the process ends
     chosen = argparse.Namespace()
     sizes.tell = lambda text: print(f"tailgate: {text}", file=sys.stderr)
     with orderly(lambda: _kept(chosen)) as ending:
@@ -44,8 +50,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _done(arguments: Sequence[str] | None, chosen: argparse.Namespace, ending: Ending) -> int:
     try:
         _parser().parse_args(arguments, chosen)
+        _check_paths(chosen)
         with _place(chosen):
-            return int(chosen.run(chosen))
+            done = int(chosen.run(chosen))
+            sys.stdout.flush()  # a full disk is an error of the command
+            return done
     except BrokenPipeError:  # the reader of our output has gone
         sys.stderr.close()
         return 0
@@ -54,12 +63,26 @@ def _done(arguments: Sequence[str] | None, chosen: argparse.Namespace, ending: E
     except Exception as error:
         if ending.number:  # a module whose import is cut off may not be importable again while the command unwinds
             return ending.last_words(error)
-        if not isinstance(error, InputError) and not (isinstance(error, ImportError) and "tailgate[" in str(error)):
+        known = isinstance(error, InputError) or (isinstance(error, ImportError) and "tailgate[" in str(error))
+        if not known and not isinstance(error, OSError):
             raise
-        print(f"tailgate: error: {error}", file=sys.stderr)
+        print(f"tailgate: error: {error if known else _unusable(error)}", file=sys.stderr)
         if isinstance(error, Killed):
             print(f"tailgate: {_kept(chosen)}", file=sys.stderr)
         return EXIT_INPUT
+
+
+def _unusable(error: BaseException) -> InputError:
+    """Return the error for a file or stream that the system refuses."""
+    name, why = getattr(error, "filename", None), getattr(error, "strerror", None)
+    return InputError("file", str(name or "standard output"), f"one that can be used ({why or error})")
+
+
+def _check_paths(chosen: argparse.Namespace) -> None:
+    """Raise InputError for an empty path of something to write: it would be the working directory, or nothing."""
+    for name in WRITTEN:
+        if getattr(chosen, name, None) == "":
+            raise InputError(f"--{name}", "", "a path")
 
 
 @contextmanager
@@ -104,6 +127,8 @@ class _Parser(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         self.given = tuple(map(str, sys.argv[1:] if args is None else args))
         found, rest = super().parse_known_args(args, namespace)
+        if rest and hasattr(found, "overrides") and all(OVERRIDE.match(text) for text in rest):  # behind an option
+            found.overrides, rest = [*found.overrides, *rest], []
         if rest:
             self.error(f"unrecognized arguments: {' '.join(rest)}")
         return found, rest

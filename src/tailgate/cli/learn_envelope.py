@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from tailgate.base.errors import InputError
-from tailgate.cli.shared import Commands, counted, print_json, say, table, working
+from tailgate.cli.shared import Commands, counted, print_json, say, table, working, written_to
 
 
 def add(commands: Commands) -> None:
@@ -47,7 +47,7 @@ def _learn(options: argparse.Namespace) -> int:
     settings, out = Settings(margin, options.tail, rate, options.unit, options.positions), Path(options.out)
     if out.suffix != ".json":
         raise InputError("--out", options.out, "a path that ends with .json")
-    with working() as update:
+    with written_to(out), working() as update:
         def shown(label: str, done: int, total: int) -> None:
             counted(update, label, "invariants" if label == "learning" else "episodes" if label == "playing" else "files")(done, total)
 

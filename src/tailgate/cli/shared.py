@@ -7,8 +7,8 @@ import json
 import secrets
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -16,6 +16,7 @@ from rich.console import Console
 
 from tailgate.base import own_modules
 from tailgate.base.errors import InputError, one_line
+from tailgate.base.files import set_aside, writable_directory
 from tailgate.base.plots import FORMS
 from tailgate.base.progress import Update, console, progress
 from tailgate.cli.tables import table as table
@@ -101,6 +102,17 @@ def picture(option: str, text: str) -> Path:
     if path.suffix.lower().removeprefix(".") not in FORMS:
         raise InputError(option, text, f"a file name that ends in {', '.join('.' + form for form in FORMS)}")
     return path
+
+
+@contextmanager
+def written_to(path: Path) -> Iterator[None]:
+    """Try that a file can be written before the work of a block, and set aside at its end what was there; say so."""
+    writable_directory(path.parent)
+    if path.is_dir():
+        raise InputError("--out", str(path), "a file, not a directory")
+    yield
+    if path.exists():
+        tell(f"{path} held something else: it is in {set_aside(path)}")
 
 
 def working() -> AbstractContextManager[Update]:

@@ -18,6 +18,7 @@ from tailgate.agents.policy.network_policy import PolicyPlan, choose
 from tailgate.agents.policy.rules import Leaf, Split, Tree, save_rules
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
+from tailgate.base.files import set_aside
 from tailgate.core import Array, draws
 from tailgate.core.kinds import EFFECTS
 from tailgate.core.spec_text import MARKS
@@ -214,6 +215,8 @@ def distil(
     with tempfile.TemporaryDirectory() as folder:
         trees = _trees(game, counts, goal, header, Path(folder) / "tree.json", tell)
     chosen = next((one for one in trees if one.damage >= goal), max(trees, key=lambda one: one.damage))
+    if out.exists():
+        set_aside(out)
     file = save_rules(out, chosen.tree, actions, header)
     own, theirs = (game.damage(attack, "report", episodes) for attack in (_attack(file), text))
     found = paired_difference(own.astype(float), theirs.astype(float), share=True)

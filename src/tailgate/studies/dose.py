@@ -90,6 +90,9 @@ def dose_response(
     counted = outcome_for(outcome, scenario)
     if exceeds is not None and is_share(counted):
         raise InputError("exceeds", exceeds, f"nothing for {counted}, which is yes or no")
+    for field, value in (("exceeds", exceeds), ("limit", limit)):
+        if value is not None and not math.isfinite(value):
+            raise InputError(field, value, "a finite number")
     share = is_share(counted) or exceeds is not None
     limit = CRITICAL if limit is None and share else limit
     if share and limit is not None and not 0.0 <= limit < 1.0:

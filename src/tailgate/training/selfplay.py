@@ -43,7 +43,7 @@ from tailgate.envs.gym.duel import Duel, Payoff
 from tailgate.estimators.challenge.steered import Steered
 from tailgate.estimators.challenge.steering import nearest
 from tailgate.evaluation.stats import Interval, paired_difference, proportion
-from tailgate.training.settings import check_mappings, check_name, mapping, parameters_of, started_with
+from tailgate.training.settings import check_folder, check_mappings, mapping, parameters_of, started_with
 from tailgate.training.train import TrainConfig, environment_of
 
 BARE = "selfplay"  # the preset where none is named
@@ -103,7 +103,7 @@ def bare() -> dict[str, Any]:
 def _checked(data: dict[str, Any]) -> GameConfig:
     check_mappings(data, ("menu", "payoff", "threat", "environment", "attacker", "defender"))
     config = build(GameConfig, data, "config")
-    check_name(config.name)
+    check_folder(config.out, config.name)
     Spec("defence", config.defence).refuse_imports("config")
     for name in config.rivals:
         Spec("attack", name).refuse_imports("config")

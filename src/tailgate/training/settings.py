@@ -32,10 +32,13 @@ def check_places(data: Iterable[str], known: Container[str], places: Mapping[str
             raise InputError("config: unknown field", key, f"the field with its place: {' or '.join(found)}")
 
 
-def check_name(name: str) -> None:
-    """Raise InputError unless the name of a run can be that of its folder."""
-    if Path(name).name != name:
+def check_folder(out: str, name: str) -> None:
+    """Raise InputError unless the name of a run can be that of its folder, and a policy in it be named as an attack."""
+    if not name or name == ".." or Path(name).name != name:
         raise InputError("config.name", name, "the name of a directory, without a separator")
+    for field, text in (("config.name", name), ("config.out", out)):
+        if ":" in text:
+            raise InputError(field, text, "no colon: in the name of an attack, parameters follow a colon")
 
 
 def started_with(held: Path) -> dict[str, Any]:

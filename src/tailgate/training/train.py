@@ -32,7 +32,7 @@ from tailgate.envs.gym.rewards import Reward
 from tailgate.evaluation.baselines import best_of
 from tailgate.evaluation.cells import cells_of
 from tailgate.play.metrics import METRICS
-from tailgate.training.settings import check_mappings, check_name, check_places, mapping, parameters_of, started_with
+from tailgate.training.settings import check_folder, check_mappings, check_places, mapping, parameters_of, started_with
 from tailgate.training.trainings import Training, train_all
 
 BARE = "quickstart"  # the preset where none is named
@@ -126,7 +126,7 @@ def checked(data: dict[str, Any]) -> TrainConfig:
     if not data.keys() <= fields_of(TrainConfig).keys():
         check_places(data, fields_of(TrainConfig), _places(data.get("learner")))
     config = build(TrainConfig, data, "config")
-    check_name(config.name)
+    check_folder(config.out, config.name)
     if config.device is not None:
         cards.checked(config.device)
     if config.outcome is not None and config.outcome not in METRICS:
