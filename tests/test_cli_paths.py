@@ -70,3 +70,19 @@ def test_every_example_names_what_there_is():
     assert main(["cost", *EXAMPLES["cost"].split()]) == 0 and len(COMMANDS) > 20
     parsed = _parser().parse_args(["rare", "kf", "--property", "G[0,60] gap > 2", "--scenario", "gusty-stop-and-go-v0"])
     assert EXAMPLES["rare"] == 'kf --property "G[0,60] gap > 2" --scenario gusty-stop-and-go-v0' and parsed.property
+
+
+def test_a_run_that_was_moved_goes_on(tmp_path, monkeypatch, capsys):
+    """Under another name, in another folder, however the folder is written: nothing is trained again."""
+    monkeypatch.chdir(tmp_path)
+    small = ["steps=2000", "episodes=5", "select_episodes=5", "rivals=[]", "others=[]", "tensorboard=false", "workers=1"]
+    assert main(["train", "name=first", "cem={population: 8, episodes: 4, hidden: []}", *small]) == 0
+    before = Path("runs/first/policy-0.safetensors").read_bytes()
+    assert main(["train", "name=first", "cem={population: 8, episodes: 4, hidden: []}", *small]) == 0
+    assert "an earlier run of this name is in runs/first.1" in capsys.readouterr().err
+    Path("kept").mkdir()
+    Path("runs/first").rename("kept/second")
+    capsys.readouterr()
+    for out in ("kept", "./kept/", str(tmp_path / "kept")):
+        assert main(["train", "--resume", "name=second", f"out={out}"]) == 0, capsys.readouterr().err
+    assert Path("kept/second/policy-0.safetensors").read_bytes() == before

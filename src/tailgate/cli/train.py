@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from tailgate.base.errors import InputError
+from tailgate.base.files import aside
 from tailgate.base.locks import alone
 from tailgate.base.progress import cells, progress
 from tailgate.cli.keys import listed
@@ -51,7 +52,9 @@ def _train(options: argparse.Namespace) -> int:
     if options.resume:
         train.same_run(config)
     errors = Console(stderr=True)
-    errors.print(f"[bold]{config.name}[/]: training against [bold]{config.defence}[/] on {config.scenario}, files in {config.directory}")
+    said = f"{config.name}: training against {config.defence} on {config.scenario}, files in {config.directory}"
+    errors.print(said, markup=False, highlight=False, soft_wrap=True)
+    before = aside(config.directory)
     place = f" out={config.out}" if config.out != type(config)().out else ""
     options.kept = f"what was finished is kept, go on with: tailgate train --resume name={config.name}{place}"
     with alone(config.directory), progress(errors) as update:
@@ -76,6 +79,8 @@ def _train(options: argparse.Namespace) -> int:
         else:
             report = comparison.compare(config, policies, played)
         page = _page(config, report)
+    for earlier in sorted(aside(config.directory) - before):
+        tell(f"an earlier run of this name is in {earlier}")
     if options.json:
         print_json(report | {"page": str(page)})
     else:
