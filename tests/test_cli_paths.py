@@ -6,11 +6,12 @@ from pathlib import Path
 
 import pytest
 
+from tailgate.base.errors import InputError
 from tailgate.cli import main
 from tailgate.cli.command_line import COMMANDS, _parser
 from tailgate.cli.examples import EXAMPLES
-
-TRAIN = ["train", "steps=2000", "tensorboard=false", "workers=1"]
+from tailgate.cli.shared import written_to
+from tailgate.training import train
 
 
 @pytest.mark.parametrize("arguments", [["name="], ["name=.."], ["name=a/b"], ["name=10:30"], ["name=a", "out=2024T10:30"]])
@@ -52,7 +53,21 @@ def test_a_stream_that_is_full_or_closed_is_no_traceback(stream, code):
     assert done.returncode == code and "Traceback" not in done.stderr and bool(done.stdout) == (stream == "2>&-")
 
 
-def test_what_was_there_is_set_aside(tmp_path, monkeypatch, capsys):
+def test_what_was_there_is_set_aside_when_the_work_is_done(tmp_path, capsys):
+    out = tmp_path / "mine.json"
+    out.write_text("mine")
+    with pytest.raises(ZeroDivisionError), written_to(out):
+        raise ZeroDivisionError
+    assert out.read_text() == "mine"
+    with written_to(out):
+        assert out.read_text() == "mine"
+    assert not out.exists() and (tmp_path / "mine.json.1").read_text() == "mine" and "mine.json.1" in capsys.readouterr().err
+    with pytest.raises(InputError, match="not a directory"), written_to(tmp_path):
+        pass
+
+
+@pytest.mark.long
+def test_rules_replace_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("rules.json").write_text("mine")
     assert main(["distil", "zoo:name=radar-following-chi2_kf-0", "--leaves", "2", "--episodes", "5"]) == 0
@@ -72,17 +87,24 @@ def test_every_example_names_what_there_is():
     assert EXAMPLES["rare"] == 'kf --property "G[0,60] gap > 2" --scenario gusty-stop-and-go-v0' and parsed.property
 
 
-def test_a_run_that_was_moved_goes_on(tmp_path, monkeypatch, capsys):
+def test_a_run_that_was_moved_goes_on(tmp_path, monkeypatch):
     """Under another name, in another folder, however the folder is written: nothing is trained again."""
     monkeypatch.chdir(tmp_path)
-    small = ["steps=2000", "episodes=5", "select_episodes=5", "rivals=[]", "others=[]", "tensorboard=false", "workers=1"]
-    assert main(["train", "name=first", "cem={population: 8, episodes: 4, hidden: []}", *small]) == 0
-    before = Path("runs/first/policy-0.safetensors").read_bytes()
-    assert main(["train", "name=first", "cem={population: 8, episodes: 4, hidden: []}", *small]) == 0
-    assert "an earlier run of this name is in runs/first.1" in capsys.readouterr().err
+    small = ["cem={population: 8, episodes: 4, hidden: []}", "steps=2000", "rivals=[]", "others=[]", "tensorboard=false", "workers=1"]
+    (policy,) = train.train(train.load_config(None, ["name=first", *small]), lambda *_: None)
+    before = policy.with_suffix(".safetensors").read_bytes()
     Path("kept").mkdir()
     Path("runs/first").rename("kept/second")
-    capsys.readouterr()
     for out in ("kept", "./kept/", str(tmp_path / "kept")):
-        assert main(["train", "--resume", "name=second", f"out={out}"]) == 0, capsys.readouterr().err
-    assert Path("kept/second/policy-0.safetensors").read_bytes() == before
+        config = train.load_config(None, ["name=second", f"out={out}"], resume=True)
+        (policy,) = train.train(config, lambda *_: pytest.fail("trained again"), resume=True)
+        assert policy.with_suffix(".safetensors").read_bytes() == before
+
+
+@pytest.mark.long
+def test_an_earlier_run_of_the_name_is_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    small = ["cem={population: 8, episodes: 4, hidden: []}", "steps=2000", "episodes=5", "select_episodes=5", "rivals=[]", "others=[]"]
+    for _ in range(2):
+        assert main(["train", "name=first", "tensorboard=false", "workers=1", *small]) == 0
+    assert "an earlier run of this name is in runs/first.1" in capsys.readouterr().err

@@ -78,14 +78,15 @@ def reason(name: str, sandbox: str | None, **limits: float) -> str:
 
 
 @pytest.mark.parametrize("command", [
-    pytest.param(["leaderboard", "submit", "theirs:Honest", "--sandbox", "bwrap", "--suite", "quick-v0", "--episodes", "1"], marks=boxed),
-    ["evaluate", "--defence", "theirs:Honest", "--attack", "none", "--seeds", "1"],
+    pytest.param(["leaderboard", "submit", "theirs:Honest", "--sandbox", "bwrap"], marks=boxed),
+    ["evaluate", "--defence", "theirs:Honest"],
 ])  # fmt: skip
 def test_a_file_beside_the_class_takes_no_packages_place(command: list[str], beside: Path) -> None:
     """Neither in the command's own process nor in one of its workers: a stranger's folder has more than the class."""
     for name in ("llvmlite", "safetensors", "pickle", "yaml"):
         (beside / f"{name}.py").write_text(PLANTED.format(place=str(beside / f"planted-{name}")))
-    whole = [sys.executable, "-P", "-m", "tailgate", *command, "--scenario", "stop-and-go-v0", "--workers", "2"]
+    (beside / "small.yaml").write_text("scenarios: [stop-and-go-v0, braking-v0]\ndefences: [none]\nattacks: [none]\nseeds: 1\n")
+    whole = [sys.executable, "-P", "-m", "tailgate", *command, "--suite", "small.yaml", "--workers", "2"]
     ended = subprocess.run(whole, cwd=beside, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
     assert not list(beside.glob("planted-*"))
