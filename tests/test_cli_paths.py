@@ -74,6 +74,7 @@ def test_rules_replace_nothing(tmp_path, monkeypatch, capsys):
     assert Path("rules.json.1").read_text() == "mine" and "rules.json.1" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_every_example_names_what_there_is():
     """The words are those of the command, and the zoo's policies, suites and models exist."""
     from tailgate.agents.policy.zoo import zoo_path

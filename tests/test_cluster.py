@@ -47,6 +47,7 @@ def test_an_error_comes_back_as_it_was_with_the_traceback_of_the_node(on_ray):
     assert "in squared" in str(found.value.__cause__)
 
 
+@pytest.mark.long
 def test_a_lost_job_is_given_again(on_ray, tmp_path):
     assert list(each(killed_at_first, [(str(tmp_path), cluster.RETRIES)], 2)) == [(0, cluster.RETRIES)]
 

@@ -279,6 +279,7 @@ def test_a_policy_that_diverges_is_an_error_of_the_step_size(name: str, action: 
         learner(name, paid | {"action": action}, learning_rate=1e38)
 
 
+@pytest.mark.long
 def test_a_policy_that_is_not_finite_is_found_where_nothing_fails(paid: dict[str, Any], tmp_path: Path) -> None:
     """The largest of values that are no numbers is a choice like any other: DQN plays on, and its end says so."""
     run = learner("dqn", paid)

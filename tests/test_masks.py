@@ -57,7 +57,7 @@ def test_one_of_the_next_steps_is_open_where_the_channel_accepts_in_one(onset, m
         state = step(state, ask if on else rest, k)
 
 
-@pytest.mark.thin(24)
+@pytest.mark.thin(40)
 @pytest.mark.parametrize("limits", LIMITS, ids=range(len(LIMITS)))
 @pytest.mark.parametrize("interval", [1, 2, 7, 20])
 @pytest.mark.parametrize("seat", SEATS)

@@ -18,6 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import tailgate
+from tailgate.base import own_modules
 from tailgate.base.errors import InputError, NotApplicable, unknown
 from tailgate.base.lazy import components
 from tailgate.core import Positive, param, registry
@@ -56,10 +57,14 @@ def plugin(tmp_path, monkeypatch):
 
 @pytest.fixture
 def shelf(monkeypatch):
-    """A registry that forgets what a test put in."""
-    monkeypatch.setattr(registry, "_entries", {family: dict(known) for family, known in registry._entries.items()})
-    monkeypatch.setattr(registry, "_plugins_loaded", set())
-    return registry
+    """A registry that forgets what a test put in, but not modules that it was the first to import."""
+    before = registry._entries
+    with monkeypatch.context() as patch:
+        patch.setattr(registry, "_entries", {family: dict(known) for family, known in before.items()})
+        patch.setattr(registry, "_plugins_loaded", set())
+        yield registry
+        for family, held in registry._entries.items():
+            before[family].update({name: entry for name, entry in held.items() if entry.built_in})
 
 
 SPECS = [
@@ -110,6 +115,7 @@ def test_a_module_that_is_not_there_is_looked_for_in_the_working_directory(tmp_p
     """The error names the folder, and a file there whose name is nearly the same."""
     (tmp_path / "mydefence.py").touch()
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(own_modules, "_wanted", False)  # as no command has been run in this process
     for there, words in (("", rf"working directory {tmp_path} and the installed packages \(did you mean 'mydefence'\?\)$"), (None, r"looked for in the installed packages$")):
         with monkeypatch.context() as patch:
             patch.setattr(sys, "path", [path for path in sys.path if path and Path(path).resolve() != tmp_path] + ([there] if there is not None else []))

@@ -202,7 +202,7 @@ def _text(tab, name):
     return tab.find_element("id", name).text
 
 
-@pytest.mark.thin(2)
+@pytest.mark.thin(3)
 @pytest.mark.page
 @pytest.mark.parametrize("width", [360, 1280])
 @pytest.mark.parametrize("name", list(CELLS))

@@ -40,7 +40,7 @@ def _episode(interval=1, shaped=True, **options):
 @pytest.mark.parametrize("ends", [False, True])
 @pytest.mark.parametrize("interval", [1, 5])
 @pytest.mark.parametrize("reward", ["collision", "min_gap", "error", "stealth"])
-@pytest.mark.thin(4)
+@pytest.mark.thin(9)
 def test_shaping_telescopes(reward, interval, ends):
     """Shaping adds gamma^T Phi(end) - Phi(start) in all. Phi(end) is 0 at an end for good, so no policy gains; a cut-off end keeps it."""
     total, discount = np.zeros(8), 1.0

@@ -75,7 +75,6 @@ def folder() -> Path | None:
     return None
 
 
-@cache
 def _safe(place: str) -> bool:
     """Return whether a folder is the user's alone, and no other user may put another one in its place."""
     found = os.stat(place)

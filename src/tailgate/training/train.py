@@ -368,8 +368,7 @@ def plan_key(config: dict[str, Any]) -> str:
 def same_run(config: TrainConfig) -> None:
     """Raise InputError when a run would be resumed with another training; more steps, and another comparison, may be asked for."""
     held = _told(config)
-    now, blank = as_data(config), as_data(TrainConfig())
-    free = free_of(config.teacher) | {"steps", "name", "out"}  # a folder may have been moved
+    now, blank, free = as_data(config), as_data(TrainConfig()), free_of(config.teacher) | {"steps", "name", "out"}  # it may have been moved
     try:
         before = load_json(held, strict=False)
         pairs = {key: (before.get(key, blank[key]), now[key]) for key in now if key not in free}
