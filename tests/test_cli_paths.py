@@ -108,4 +108,4 @@ def test_an_earlier_run_of_the_name_is_named(tmp_path, monkeypatch, capsys):
     small = ["cem={population: 8, episodes: 4, hidden: []}", "steps=2000", "episodes=5", "select_episodes=5", "rivals=[]", "others=[]"]
     for _ in range(2):
         assert main(["train", "name=first", "tensorboard=false", "workers=1", *small]) == 0
-    assert "an earlier run of this name is in runs/first.1" in capsys.readouterr().err
+    assert "runs/first held an earlier run; it is in runs/first.1" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""What surrounds a stranger's class: nothing beside it is imported, and in bubblewrap no call leads to what outlives or surrounds it."""
+"""A stranger's class: no other file of its folder is imported, and in bubblewrap no system call leads out of the sandbox."""
 
 import os
 import re
@@ -64,7 +64,7 @@ boxed = pytest.mark.skipif(shutil.which("bwrap") is None, reason="bubblewrap is 
 
 
 @pytest.fixture
-def beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "theirs.py").write_text(CLASSES)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "src"))
@@ -81,25 +81,25 @@ def reason(name: str, sandbox: str | None, **limits: float) -> str:
     pytest.param(["leaderboard", "submit", "theirs:Honest", "--sandbox", "bwrap"], marks=boxed),
     ["evaluate", "--defence", "theirs:Honest"],
 ])  # fmt: skip
-def test_a_file_beside_the_class_takes_no_packages_place(command: list[str], beside: Path) -> None:
+def test_a_file_in_the_folder_of_the_class_replaces_no_package(command: list[str], folder: Path) -> None:
     """Neither in the command's own process nor in one of its workers: a stranger's folder has more than the class."""
     for name in ("llvmlite", "safetensors", "pickle", "yaml"):
-        (beside / f"{name}.py").write_text(PLANTED.format(place=str(beside / f"planted-{name}")))
-    (beside / "small.yaml").write_text("scenarios: [stop-and-go-v0, braking-v0]\ndefences: [none]\nattacks: [none]\nseeds: 1\n")
+        (folder / f"{name}.py").write_text(PLANTED.format(place=str(folder / f"planted-{name}")))
+    (folder / "small.yaml").write_text("scenarios: [stop-and-go-v0, braking-v0]\ndefences: [none]\nattacks: [none]\nseeds: 1\n")
     whole = [sys.executable, "-P", "-m", "tailgate", *command, "--suite", "small.yaml", "--workers", "2"]
-    ended = subprocess.run(whole, cwd=beside, capture_output=True, text=True, check=False)
+    ended = subprocess.run(whole, cwd=folder, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
-    assert not list(beside.glob("planted-*"))
+    assert not list(folder.glob("planted-*"))
 
 
 @boxed
-def test_no_call_leads_out_of_the_sandbox(beside: Path) -> None:
+def test_no_call_leads_out_of_the_sandbox(folder: Path) -> None:
     """Three directories of a limited size can be written; keyrings, anonymous memory, mounts and odd sockets are refused."""
     held = re.search(r"written (.*) made (.*) sockets (.*)", reason("Trying", "bwrap"))
     assert held is not None and held.groups() == ("['/tmp/x', '/dev/shm/x', '/scratch/x']", "[]", "[1, 2]")
 
 
-def test_the_time_of_children_that_nobody_waits_for_counts(beside: Path) -> None:
+def test_the_time_of_children_counts_though_nobody_waits_for_them(folder: Path) -> None:
     assert "processor time" in reason("Shirking", None, start_time=3.0, silence=10.0)
 
 

@@ -97,7 +97,7 @@ def test_what_is_long_is_announced(monkeypatch: pytest.MonkeyPatch) -> None:
     train.long(train.load_config(None, []))
     sizes.announce(7200.0, 5e9, "9 episodes")
     assert told == [
-        "3 trainings of 100,000,000,000 decisions take at least 2.3 days, on a fast machine",
+        "3 trainings of 100,000,000,000 decisions take at least 1.2 days, on a fast machine",
         "9 episodes take at least 2.0 hours and 5.0 GB of memory, on a fast machine",
     ]
 

@@ -64,7 +64,7 @@ class Tally(NamedTuple):
     least: Array  # smallest gap so far, within the reward's reach [m]
     error: Array  # largest error of an agent, where there is no road
     peak: Array  # the largest of the episode so far, where the reward is for that
-    crashed: Array  # bool: there was a collision
+    crashed: Array  # bool: there was a collision, where none ends an episode
 
 
 class Sums(NamedTuple):
@@ -238,8 +238,11 @@ class Seat:
         least, peak, largest = reward.least(gap, tally.least), tally.peak, tally.error
         if reward.payment.peak:
             peak = np.maximum(np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1), peak)
-        new = frame._replace(collided=frame.collided & ~tally.crashed, rear_collided=frame.rear_collided & ~tally.crashed)
-        gained = reward(loop.model, new, tally.least - least, frame.k == loop.horizon, peak - tally.peak)
+        first, crashed = frame, tally.crashed
+        if not loop.ends_on_collision:  # else there is no second collision
+            first = frame._replace(collided=frame.collided & ~crashed, rear_collided=frame.rear_collided & ~crashed)
+            crashed = crashed | frame.collided | frame.rear_collided
+        gained = reward(loop.model, first, tally.least - least, frame.k == loop.horizon, peak - tally.peak)
         potential = np.where(live, reward.potential(gap, self._believed(frame)), tally.potential)
         if not self.road:
             largest = np.where(live, np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1), largest)
@@ -248,7 +251,7 @@ class Seat:
             sums.rear_collided | (frame.rear_collided & live), sums.refused | (frame.refused & live),
             sums.accepted | (frame.command.kind != Kind.NONE),  # also behind a collision, which no mask foresees
         )  # fmt: skip
-        return state, Tally(potential, least, largest, peak, tally.crashed | frame.collided | frame.rear_collided), sums, frame
+        return state, Tally(potential, least, largest, peak, crashed), sums, frame
 
     def closed(self, state: LoopState, tally: Tally, sums: Sums, over: Array) -> Outcome:
         """Return the outcome of a decision, after its last step."""

@@ -31,7 +31,7 @@ Width = Annotated[int, Field(ge=1, le=100_000)]  # of a layer
 WORKER = 150e6  # [bytes] per worker process
 ROW = 9e3  # [bytes] per row in memory
 ENVIRONMENT = 1.2e3  # [bytes] per environment of a batch, without its matrices
-EPISODES_A_SECOND, DECISIONS_A_SECOND = 5_000, 1_000_000  # upper limits per process
+EPISODES_A_SECOND, DECISIONS_A_SECOND = 5_000, 2_000_000  # upper limits per process
 LONG = 1800.0  # [s] beyond which work is announced
 
 tell: Callable[[str], None] | None = None

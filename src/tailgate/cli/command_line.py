@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import errno
 import os
 import re
 import shutil
@@ -27,6 +28,7 @@ from tailgate.cli.examples import EXAMPLES, GROUPS
 
 EXIT_INPUT = 2
 WRITTEN = ("out", "plot", "parquet", "video")  # options that name something to write
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # a stream that takes no more
 OVERRIDE = re.compile(r"[A-Za-z_][\w.]*=")  # the beginning of key=value
 CHOICE, OPTION = 0.6, 0.75  # likeness from which a name is suggested; options have their dashes in common
 COMMANDS = (
@@ -63,19 +65,14 @@ def _done(arguments: Sequence[str] | None, chosen: argparse.Namespace, ending: E
     except Exception as error:
         if ending.number:  # a module whose import is cut off may not be importable again while the command unwinds
             return ending.last_words(error)
-        known = isinstance(error, InputError) or (isinstance(error, ImportError) and "tailgate[" in str(error))
-        if not known and not isinstance(error, OSError):
+        if isinstance(error, OSError) and (error.filename is not None or error.errno in FULL):
+            error = InputError("file", str(error.filename or "standard output"), f"one that can be used ({error.strerror})")
+        if not isinstance(error, InputError) and not (isinstance(error, ImportError) and "tailgate[" in str(error)):
             raise
-        print(f"tailgate: error: {error if known else _unusable(error)}", file=sys.stderr)
+        print(f"tailgate: error: {error}", file=sys.stderr)
         if isinstance(error, Killed):
             print(f"tailgate: {_kept(chosen)}", file=sys.stderr)
         return EXIT_INPUT
-
-
-def _unusable(error: BaseException) -> InputError:
-    """Return the error for a file or stream that the system refuses."""
-    name, why = getattr(error, "filename", None), getattr(error, "strerror", None)
-    return InputError("file", str(name or "standard output"), f"one that can be used ({why or error})")
 
 
 def _check_paths(chosen: argparse.Namespace) -> None:

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from tailgate.base.files import aside, writable_directory
-from tailgate.cli.shared import Commands, add_options, own_classes, played_by, say, show, table, tell, threat_of, working
+from tailgate.base.files import writable_directory
+from tailgate.cli.shared import Commands, add_options, own_classes, played_by, say, show, table, telling_aside, threat_of, working
 
 
 def add(commands: Commands) -> None:
@@ -35,14 +35,11 @@ def _distil(options: argparse.Namespace) -> int:
     own_classes()
     out = Path(options.out)
     writable_directory(out.parent)
-    before = aside(out)
-    with working() as update:
+    with telling_aside(out), working() as update:
         report = distil(
             options.policy, out, scenario=options.scenario, defence=options.defence, threat=threat_of(options),
             leaves=options.leaves, loss=options.loss, episodes=options.episodes, tell=lambda done, of: update("trees", done, of, ""),
         )  # fmt: skip
-    for earlier in sorted(aside(out) - before):
-        tell(f"{out} held something else: it is in {earlier}")
     show(options, report, _print)
     return 0
 

@@ -11,8 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tailgate.base.files import aside, writable_directory
-from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, tell, threat_of, working
+from tailgate.base.files import writable_directory
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, tell, telling_aside, threat_of, working
 from tailgate.core.schema import canonical, scalar
 
 if TYPE_CHECKING:
@@ -62,15 +62,12 @@ def _evaluate(options: argparse.Namespace) -> int:
     if options.plot:
         writable_directory(Path(options.plot), "plot")
     options.kept = f"the same command goes on with the rows of {options.out}" if options.out else "nothing is kept: --out FILE would"
-    before = aside(options.out)
-    with working() as update:
+    with telling_aside(options.out, "something else than these rows"), working() as update:
         rows = evaluate(
             suite, defences=options.defence, attacks=options.attack, scenarios=options.scenario, doses=doses,
             seeds=options.seeds, purpose=options.purpose, batch=options.batch, workers=options.workers,
             out=options.out, threat=threat, progress=counted(update, "playing"), metrics=options.metric or (),
         )  # fmt: skip
-    for earlier in sorted(aside(options.out) - before):
-        tell(f"{options.out} held something else than these rows; it is in {earlier}")
     table = summarise(rows)
     own = rows[0].get("metrics", []) if rows else []
     show(options, table, partial(_print_summary, own=own))

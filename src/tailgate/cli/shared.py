@@ -16,7 +16,7 @@ from rich.console import Console
 
 from tailgate.base import own_modules
 from tailgate.base.errors import InputError, one_line
-from tailgate.base.files import set_aside, writable_directory
+from tailgate.base.files import aside, set_aside, writable_directory
 from tailgate.base.plots import FORMS
 from tailgate.base.progress import Update, console, progress
 from tailgate.cli.tables import table as table
@@ -105,6 +105,15 @@ def picture(option: str, text: str) -> Path:
 
 
 @contextmanager
+def telling_aside(path: Path | str | None, held: str = "something else") -> Iterator[None]:
+    """Say at the end of a block what was set aside at a path meanwhile; held: what it held before."""
+    before = aside(path)
+    yield
+    for earlier in sorted(aside(path) - before):
+        tell(f"{path} held {held}; it is in {earlier}")
+
+
+@contextmanager
 def written_to(path: Path) -> Iterator[None]:
     """Try that a file can be written before the work of a block, and set aside at its end what was there; say so."""
     writable_directory(path.parent)
@@ -112,7 +121,7 @@ def written_to(path: Path) -> Iterator[None]:
         raise InputError("--out", str(path), "a file, not a directory")
     yield
     if path.exists():
-        tell(f"{path} held something else: it is in {set_aside(path)}")
+        tell(f"{path} held something else; it is in {set_aside(path)}")
 
 
 def working() -> AbstractContextManager[Update]:

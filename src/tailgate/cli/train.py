@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from tailgate.base.errors import InputError
-from tailgate.base.files import aside
 from tailgate.base.locks import alone
 from tailgate.base.progress import cells, progress
 from tailgate.cli.keys import listed
-from tailgate.cli.shared import Commands, add_options, own_classes, played_by, print_json, say, table, tell
+from tailgate.cli.shared import Commands, add_options, own_classes, played_by, print_json, say, table, tell, telling_aside
 
 if TYPE_CHECKING:
     from tailgate.agents.learners.learning import Progress
@@ -54,10 +53,9 @@ def _train(options: argparse.Namespace) -> int:
     errors = Console(stderr=True)
     said = f"{config.name}: training against {config.defence} on {config.scenario}, files in {config.directory}"
     errors.print(said, markup=False, highlight=False, soft_wrap=True)
-    before = aside(config.directory)
     place = f" out={config.out}" if config.out != type(config)().out else ""
     options.kept = f"what was finished is kept, go on with: tailgate train --resume name={config.name}{place}"
-    with alone(config.directory), progress(errors) as update:
+    with telling_aside(config.directory, "an earlier run"), alone(config.directory), progress(errors) as update:
 
         decisions: dict[int, int] = {}
 
@@ -79,8 +77,6 @@ def _train(options: argparse.Namespace) -> int:
         else:
             report = comparison.compare(config, policies, played)
         page = _page(config, report)
-    for earlier in sorted(aside(config.directory) - before):
-        tell(f"an earlier run of this name is in {earlier}")
     if options.json:
         print_json(report | {"page": str(page)})
     else:

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tailgate.base.errors import InputError
-from tailgate.base.files import aside
 from tailgate.cli.automata import add_automata, run_automata
 from tailgate.cli.prove import add_prove, refuse, refuse_proofs, run_prove
-from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, tell, values, working
+from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, tell, telling_aside, values, working
 from tailgate.core.schema import scalar
 
 if TYPE_CHECKING:
@@ -108,9 +107,8 @@ def _trust(options: argparse.Namespace) -> int:
     if runs is None and rule is not None:
         runs = 10_000
     place = Path(options.out) / ROWS if options.out else None
-    before = aside(place)
     options.kept = "the same command goes on" if options.out else "nothing is kept: --out DIR would"
-    with working() as update:
+    with telling_aside(place, "other cells"), working() as update:
         found = check(
             suite, runs=runs, formulas=options.property, alpha=options.alpha, purpose=options.purpose, beacon=options.beacon,
             batch=options.batch,
@@ -119,8 +117,6 @@ def _trust(options: argparse.Namespace) -> int:
             asked=build(Demands, values("--demand", options.demand), "--demand"), rule=rule,
             progress=counted(update, "model checking"),
         )  # fmt: skip
-    for earlier in sorted(aside(place) - before):
-        tell(f"{options.out} held other cells; they are in {earlier}")
     show(options, found, partial(_print, folder=options.out) if rule is None else _print_cells)
     lost = [cell for cell in found["cells"] if cell["status"] == "error"]
     for cell in lost:

@@ -76,12 +76,12 @@ class Guard:
         self.spent: dict[tuple[int, str], float] = {}  # [s] that each process was last seen to have used, by number and start
         given, answers = job["pipes"]
         self.prints, wrote = os.pipe()
-        filtering = _filled(bytes.fromhex(job["filter"])) if job["filter"] else []
+        filtering = _filled(bytes.fromhex(job["filter"])) if job["filter_word"] in job["command"] else []
         self.life = sys.stdin.fileno()
         self.listening = [self.life, self.prints]
         # start_new_session: a terminal's signal reaches only the user's process, which then closes the pipe
         self.child = subprocess.Popen(
-            [str(filtering[0]) if filtering and word == job["filter_word"] else word for word in job["command"]], stdin=given,
+            [str(filtering[0]) if word == job["filter_word"] else word for word in job["command"]], stdin=given,
             stdout=answers, stderr=wrote, cwd=job["scratch"], env=job["environment"], start_new_session=True, pass_fds=filtering,
         )  # fmt: skip
         for fd in (given, answers, wrote, *filtering):
