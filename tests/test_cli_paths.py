@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tailgate.base.errors import InputError
+from tailgate.base.files import GENERATOR, write_html
 from tailgate.cli import main
 from tailgate.cli.command_line import COMMANDS, _parser
 from tailgate.cli.examples import EXAMPLES
@@ -45,6 +46,28 @@ def test_a_path_or_number_without_a_meaning_is_one_line(arguments, tmp_path, mon
     assert main(arguments) == 2
     told = capsys.readouterr().err
     assert told.startswith("tailgate: error: ") and told.count("\n") == 1
+
+
+@pytest.mark.parametrize("arguments", [
+    ["fit", "--out", "x/y.json"], ["fit", "--plot", "x/y.png"], ["detect-log", "asta-braking", "--defence", "kf", "--parquet", "x/y.parquet"],
+    ["leaderboard", "verify", "--rows", "none.jsonl", "--out", "x/y.json"], ["leaderboard", "export", "quick-v1", "--format", "csv", "--out", "x/y.csv"],
+    *(["replay", "none.jsonl", "--out", "p", *more] for more in (["--video", "x/y.gif"], ["--export", "x/y.csv"], ["--out", "x/y.html"])),
+])  # fmt: skip
+def test_a_file_that_cannot_be_written_is_said_before_the_work(arguments, tmp_path, monkeypatch, capsys):
+    """Here a file takes the place of its folder."""
+    monkeypatch.chdir(tmp_path)
+    Path("x").write_text("mine")
+    assert main(arguments) == 2
+    told = capsys.readouterr().err
+    assert "'x'" in told and "not a file" in told and [path.name for path in tmp_path.iterdir()] == ["x"]
+
+
+def test_a_page_that_is_not_of_this_package_is_set_aside(tmp_path):
+    page = tmp_path / "index.html"
+    page.write_text("mine")
+    for _ in range(2):
+        write_html(page, b"<head>" + GENERATOR)
+    assert (tmp_path / "index.html.1").read_text() == "mine" and len(list(tmp_path.iterdir())) == 2
 
 
 @pytest.mark.parametrize(("stream", "code"), [(">/dev/full", 2), (">&-", 0), ("2>&-", 0)])

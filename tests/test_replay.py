@@ -105,14 +105,14 @@ def test_a_changed_scenario_file_is_noticed(folder, pick):
     "change, verdict",
     [
         ({"trace_hash": "0" * 32}, "decisions"), ({"trace_hash": "0" * 32, "decision_hash": "0" * 32}, "different"),
-        ({"trace_hash": None, "decision_hash": None}, "unknown"), ({"version": "0.0.1"}, "same"),
+        ({"trace_hash": None, "decision_hash": None}, "unknown"), ({"version": "0.0.1"}, "same"), ({"min_gap": 1.0}, "figures"),
     ],
 )  # fmt: skip
 def test_the_verdict_follows_the_hashes(pick, change, verdict):
-    """Trace and decision hash decide; another version is said, and is not held against the trace."""
+    """Trace and decision hash decide; another version is said, and is not held against the trace; another figure is."""
     replay = play(pick() | change)
     assert replay.verdict == verdict
-    assert [check.name for check in replay.differences] == (["version"] if "version" in change else [])
+    assert [check.name for check in replay.differences] == [name for name in ("version", "min_gap") if name in change]
     text = render(replay)
     assert ("row <b>0.0.1</b>" in text) == ("version" in change)
 

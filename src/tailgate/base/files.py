@@ -17,6 +17,7 @@ from typing import IO
 
 from tailgate.base.errors import InputError
 
+GENERATOR = b'<meta name="generator" content="Tailgate">'  # in every page
 TEMPORARY = ".tmp"  # suffix of temporary files
 
 step: Callable[[str, Path], None] | None = None
@@ -88,6 +89,13 @@ def write_atomic(path: Path, content: bytes, field: str = "out") -> None:
 def write_json(path: Path, data: object, field: str = "out") -> None:
     """Write data as JSON, as `write_atomic` writes. Raise ValueError for NaN and infinity, which JSON does not have."""
     write_atomic(path, json.dumps(data, indent=1, allow_nan=False).encode() + b"\n", field)
+
+
+def write_html(path: Path, content: bytes, field: str = "out") -> None:
+    """Write an HTML page as `write_atomic` writes; a file there that is no page of this package is set aside first."""
+    if path.is_file() and GENERATOR not in path.read_bytes():
+        set_aside(path, field)
+    write_atomic(path, content, field)
 
 
 def sweep(path: Path) -> None:

@@ -15,7 +15,7 @@ from tailgate.base import sizes
 from tailgate.base.errors import InputError
 from tailgate.base.locks import alone
 from tailgate.base.progress import cells, progress
-from tailgate.cli.shared import Commands, add_options, own_classes, print_json, table
+from tailgate.cli.shared import Commands, add_options, own_classes, print_json, table, telling_aside
 
 
 def add(actions: Commands) -> None:
@@ -145,6 +145,6 @@ def _page(options: argparse.Namespace) -> int:
 
     boards = [load(name) for name in options.boards]
     measured = [Attachments.of(Path(name)) for name in options.boards]
-    page = build_site(boards, Path(options.out), title=options.title, replays=not options.no_replays, measured=measured)
-    print(page)
+    with telling_aside(Path(options.out) / "index.html"):
+        print(build_site(boards, Path(options.out), title=options.title, replays=not options.no_replays, measured=measured))
     return 0

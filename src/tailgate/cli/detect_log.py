@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from tailgate.base.errors import InputError
-from tailgate.cli.shared import Commands, counted, own_classes, picture, say, show, table, tell, threat_of, working
+from tailgate.cli.shared import Commands, counted, own_classes, picture, say, show, table, tell, threat_of, working, written
 
 
 def add(commands: Commands) -> None:
@@ -54,7 +53,7 @@ def _detect(options: argparse.Namespace) -> int:
         raise InputError("--hours", options.hours, "a number from 0.001 to 1000")
     if not 0.0 <= options.length <= 100.0:
         raise InputError("--length", options.length, "a number from 0 to 100 m")
-    plot = picture("--plot", options.plot) if options.plot else None
+    plot, parquet = picture("--plot", options.plot), written("--parquet", options.parquet)
     choice = Choice(options.vehicle, options.lead, options.length, mapping_of(options.map))
     recordings = read(options.file, options.format, choice)
     if bare := [f"{what}={column}" for what, column, unit in choice.mapping if not unit and what != "t"]:
@@ -66,8 +65,8 @@ def _detect(options: argparse.Namespace) -> int:
     settings = Settings(noise, options.window, options.dose, tuple(threat_of(options).items()), options.hours)
     with working() as update:
         rows, replays = detect(recordings, options.defence, options.attack, settings, counted(update, "replaying", "replays"))
-    if options.parquet and replays:
-        write_parquet(Path(options.parquet), replays)
+    if parquet is not None and replays:
+        write_parquet(parquet, replays)
     if plot is not None and replays:
         write_atomic(plot, draw(replays[-1], plot.suffix.lower()[1:]), "plot")
     show(options, rows, _tables)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 
 from tailgate.base import sizes
-from tailgate.cli.shared import Commands
+from tailgate.cli.shared import Commands, written
 
 
 def add(actions: Commands) -> None:
@@ -31,9 +30,10 @@ def _export(options: argparse.Namespace) -> int:
 
     if options.most is not None:
         sizes.check("most", options.most)
+    out = written("--out", options.out)
     content = exported(load(options.board), options.format, options.most)
-    if options.out:
-        write_atomic(Path(options.out), content)
+    if out is not None:
+        write_atomic(out, content)
     else:
         sys.stdout.buffer.write(content)
         sys.stdout.buffer.flush()

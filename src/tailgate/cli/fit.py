@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
-from pathlib import Path
 from typing import Any
 
 from tailgate.base.errors import InputError
-from tailgate.cli.shared import Commands, counted, picture, say, show, table, working
+from tailgate.cli.shared import Commands, counted, picture, say, show, table, working, written
 
 
 def add(commands: Commands) -> None:
@@ -45,13 +44,13 @@ def _fit(options: argparse.Namespace) -> int:
     from tailgate.base.files import write_atomic, write_json
     from tailgate.roads.fit import DELAYS, Settings, draw, fit
 
-    plot = picture("--plot", options.plot) if options.plot else None
+    plot, out = picture("--plot", options.plot), written("--out", options.out)
     given = {"window": options.window, "delays": tuple(options.delay or DELAYS)}
     settings = Settings(**given) if options.trace is None else Settings(tuple(map(_trace, options.trace)), **given)
     with working() as update:
         held = fit(settings, counted(update, "fitting", "fits"))
-    if options.out:
-        write_json(Path(options.out), held)
+    if out is not None:
+        write_json(out, held)
     if plot is not None:
         write_atomic(plot, draw(held, form=plot.suffix.lower()[1:]), "plot")
     show(options, held, _tables)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from tailgate.cli import admit, attack, board, check, clock, detect, export, gap, retrain, schedules, submit, trial, verify
-from tailgate.cli.shared import Commands, add_options
+from tailgate.cli.shared import Commands, add_options, telling_aside
 
 
 def add(commands: Commands) -> None:
@@ -30,5 +30,6 @@ def _build(options: argparse.Namespace) -> int:
     rows = [row for name in options.rows for row in read_rows(Path(name))]
     if not rows:
         raise InputError("--rows", options.rows, "at least one row of an evaluation in them")
-    print(build(rows, Path(options.out), title=options.title))
+    with telling_aside(Path(options.out) / "index.html"):
+        print(build(rows, Path(options.out), title=options.title))
     return 0

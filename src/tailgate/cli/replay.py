@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from tailgate.base.errors import InputError
-from tailgate.cli.shared import Commands, own_classes, print_json, say
+from tailgate.cli.shared import Commands, own_classes, print_json, say, telling_aside, written
 
 
 def add(commands: Commands) -> None:
@@ -58,7 +58,7 @@ def _replay(options: argparse.Namespace) -> int:
     from tailgate.core.registry import Spec
     from tailgate.envs.render.viewer import Viewer
     from tailgate.evaluation.rows import read_rows
-    from tailgate.replay.page import failed, outcome, write_page
+    from tailgate.replay.page import failed, outcome, page_at, write_page
     from tailgate.replay.replay import Filter, choose, play
 
     video = Path(options.video) if options.video else None
@@ -72,6 +72,10 @@ def _replay(options: argparse.Namespace) -> int:
 
     for file in options.export:
         check_path(Path(file))
+        written("--export", file)
+    written("--video", options.video)
+    place = page_at(Path(options.out))
+    written("--out", str(place))
     viewer = Viewer(options.viewer, _size(options.size))
     defence = Spec("defence", options.defence or "none")
     if defence.imports or defence.sandboxed or Spec("attack", options.attack or "none").imports:
@@ -80,7 +84,8 @@ def _replay(options: argparse.Namespace) -> int:
     source = Path(options.rows)
     chosen = choose(read_rows(source), wanted)
     replay = play(chosen.row, wanted)
-    page = write_page(replay, Path(options.out), f"line {chosen.line} of {source.name}", options.agent)
+    with telling_aside(place):
+        page = write_page(replay, place, f"line {chosen.line} of {source.name}", options.agent)
     exports = [write_episode(replay.trace, Path(file)) for file in options.export]
     film = write_video(replay, video, viewer) if video is not None else None
     row = chosen.row
@@ -97,7 +102,7 @@ def _replay(options: argparse.Namespace) -> int:
         print_json(report)
     else:
         _print(report, film)
-    return 1 if replay.verdict == "different" else 0
+    return 1 if replay.verdict in ("different", "figures") else 0
 
 
 def _print(report: dict[str, Any], film: str | None) -> None:

@@ -96,12 +96,11 @@ def played_by(scenario: str, defence: str, attack: str, threat: dict[str, Any]) 
     return shlex.join(words)
 
 
-def picture(option: str, text: str) -> Path:
-    """Return the file of a picture. Raises InputError for another ending than that of what is drawn."""
-    path = Path(text)
-    if path.suffix.lower().removeprefix(".") not in FORMS:
+def picture(option: str, text: str | None) -> Path | None:
+    """Return the file of a picture, if any. Raises InputError for one that cannot be written, or has another ending than a picture's."""
+    if text is not None and Path(text).suffix.lower().removeprefix(".") not in FORMS:
         raise InputError(option, text, f"a file name that ends in {', '.join('.' + form for form in FORMS)}")
-    return path
+    return written(option, text)
 
 
 @contextmanager
@@ -113,12 +112,21 @@ def telling_aside(path: Path | str | None, held: str = "something else") -> Iter
         tell(f"{path} held {held}; it is in {earlier}")
 
 
+def written(option: str, text: str | None) -> Path | None:
+    """Return the file that an option names, once it is sure that it can be written. Raises InputError where it cannot."""
+    if text is None:
+        return None
+    path = Path(text)
+    writable_directory(path.parent, option, asked=path)
+    if path.is_dir() or not path.name:
+        raise InputError(option, text, "a file, not a directory")
+    return path
+
+
 @contextmanager
 def written_to(path: Path) -> Iterator[None]:
     """Try that a file can be written before the work of a block, and set aside at its end what was there; say so."""
-    writable_directory(path.parent)
-    if path.is_dir():
-        raise InputError("--out", str(path), "a file, not a directory")
+    written("--out", str(path))
     yield
     if path.exists():
         tell(f"{path} held something else; it is in {set_aside(path)}")

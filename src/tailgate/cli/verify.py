@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from tailgate.base.errors import InputError
-from tailgate.cli.shared import MORE, SHOWN, Commands, add_options, counted, drawn_by, own_classes, sample_seed, say, show, table, working
+from tailgate.cli.shared import MORE, SHOWN, Commands, add_options, counted, drawn_by, own_classes, sample_seed, say, show, working, written
+from tailgate.cli.tables import table
 
 
 def add(actions: Commands) -> None:
@@ -33,14 +34,12 @@ def add(actions: Commands) -> None:
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from tailgate.base.files import writable_directory, write_json
+    from tailgate.base.files import write_json
     from tailgate.board.verified import digest
     from tailgate.evaluation.rows import Row, read_rows
     from tailgate.evaluation.verify import verify
 
-    if options.out is not None:  # before anything is played
-        writable_directory(Path(options.out).parent)
-
+    out = written("--out", options.out)
     rows: list[Row] = []
     origin, held_in = [], []
     for name in options.rows:
@@ -61,8 +60,8 @@ def _verify(options: argparse.Namespace) -> int:
         )  # fmt: skip
     for finding in report["findings"]:
         finding["file"], finding["line"] = origin[finding["line"] - 1]
-    if options.out is not None:
-        write_json(Path(options.out), report)
+    if out is not None:
+        write_json(out, report)
     show(options, report, _print)
     return 1 if report["counts"]["differs"] or not report["counts"]["verified"] else 0
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tailgate.base.assets import embedded, inline, templates
-from tailgate.base.files import writable_directory, write_atomic
+from tailgate.base.files import write_html
 from tailgate.board.words import names_of
 from tailgate.play.metrics import METRICS, unit_in
 
@@ -21,6 +21,7 @@ from .replay import Replay
 
 VERDICTS = {
     "same": ("good", "The same trace, bit for bit", "every signal of every step has the hash that the row records"),
+    "figures": ("bad", "The trace of the row, but other figures", "every signal agrees, and metrics differ from what the row records"),
     "decisions": ("warn", "The same decisions, not the same bits", "commands, alarms, modes and collisions agree, other signals differ"),
     "different": ("bad", "NOT the episode of the row", "trace and decisions differ from what the row records"),
     "unknown": ("warn", "Cannot be checked", "the row records no hash"),
@@ -153,8 +154,13 @@ def render(replay: Replay, source: str = "", agent: int | None = None) -> str:
     return templates(here).get_template("page.html").render(css=css, js=js, data=data, **context_of(replay, source))
 
 
+def page_at(out: Path) -> Path:
+    """Return the file of a page: `out` if it is an .html file, else index.html in that directory."""
+    return out if out.suffix.lower() in (".html", ".htm") else out / "index.html"
+
+
 def write_page(replay: Replay, out: Path, source: str = "", agent: int | None = None) -> Path:
-    """Write the page to `out`, an .html file or a directory for index.html, and return its path."""
-    path = out if out.suffix.lower() in (".html", ".htm") else writable_directory(out) / "index.html"
-    write_atomic(path, render(replay, source, agent).encode("utf-8", "replace"))  # a lone surrogate in a row must not stop the page
+    """Write the page to `page_at(out)`, and return its path."""
+    path = page_at(out)
+    write_html(path, render(replay, source, agent).encode("utf-8", "replace"))  # a lone surrogate in a row must not stop the page
     return path

@@ -32,7 +32,7 @@ from tailgate.play.metrics import measure
 from tailgate.play.trace import Recorder, Trace, signals_of
 
 Row = dict[str, Any]
-Verdict = Literal["same", "decisions", "different", "unknown"]
+Verdict = Literal["same", "figures", "decisions", "different", "unknown"]
 
 
 @dataclass(frozen=True)
@@ -156,11 +156,11 @@ class Replay:
 
     @property
     def verdict(self) -> Verdict:
-        """Return whether the trace is the same, only its decisions are, it differs, or the row records no hash."""
+        """Return whether the trace is the same, its metrics are not, only its decisions are, it differs, or the row records no hash."""
         by_name = {check.name: check for check in self.checks}
         trace, decisions = by_name["trace_hash"], by_name["decision_hash"]
         if trace.same:
-            return "same"
+            return "figures" if self._figures else "same"
         if not trace.row and not decisions.row:
             return "unknown"
         return "decisions" if decisions.same else "different"
@@ -168,8 +168,13 @@ class Replay:
     @property
     def differences(self) -> list[Check]:
         """Return fields and metrics that differ from the row, except the hashes of the trace."""
-        figures = [Check(name, _figure(self.row[name]), _figure(value)) for name, value in self.metrics.items()]
-        return [check for check in (*self.checks[2:], *figures) if not check.same]
+        return [*(check for check in self.checks[2:] if not check.same), *self._figures]
+
+    @property
+    def _figures(self) -> list[Check]:
+        """Return the metrics that differ from the row."""
+        figures = (Check(name, _figure(self.row[name]), _figure(value)) for name, value in self.metrics.items())
+        return [check for check in figures if not check.same]
 
     @property
     def keys(self) -> Keys:

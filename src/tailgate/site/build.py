@@ -12,7 +12,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from tailgate.base.errors import InputError
-from tailgate.base.files import writable_directory, write_atomic
+from tailgate.base.files import writable_directory, write_atomic, write_html
 from tailgate.board.attachments import Attachments
 from tailgate.board.files import read_board
 from tailgate.board.order import GROUPS, ordered
@@ -97,5 +97,5 @@ def build_site(
     files["summary.json"] = encoded(summary | {"sha256": dict(sorted(hashes.items()))}, "summary")
     for name, content in files.items():
         write_atomic(folder / name, content)
-    write_atomic(folder / "index.html", first)  # last: what it links to is there
+    write_html(folder / "index.html", first)  # last: what it links to is there
     return folder / "index.html"

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tailgate.base.errors import InputError
-from tailgate.base.files import writable_directory, write_atomic
+from tailgate.base.files import writable_directory, write_atomic, write_html
 from tailgate.board.damage import has_road
 from tailgate.board.entry import reference
 from tailgate.board.schema import Data
@@ -225,5 +225,5 @@ def build(
     summary = {"title": title, **facts, "cells": cells, "curve": curve, "headline": headline}
     folder = writable_directory(Path(out))
     write_atomic(folder / "summary.json", encoded(summary, "summary"))
-    write_atomic(folder / "index.html", page)
+    write_html(folder / "index.html", page)
     return folder / "index.html"
