@@ -22,7 +22,7 @@ def test_times_in_words(seconds: float, words: str) -> None:
 
 def test_lines_have_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
     """From the pace since the first update: a resumed run did not do at once what it found."""
-    out, now = io.StringIO(), iter([0.0, 30.0, 60.0, 61.0])
+    out, now = io.StringIO(), iter([0.0, 0.0, 30.0, 60.0, 61.0])
     monkeypatch.setattr(progress.time, "monotonic", lambda: next(now))
     with progress.progress(Console(file=out)) as update:
         update("searches", 40, 100, "")
@@ -32,6 +32,15 @@ def test_lines_have_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
     assert out.getvalue().splitlines() == [
         "searches: 40 %", "searches: 50 % 5 of 10 (30 s, about 2.5 min left)", "searches: 100 % 10 of 10 (61 s)",
     ]  # fmt: skip
+
+
+def test_a_minute_without_a_tenth_has_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    out, now = io.StringIO(), iter([0.0, 1.0, 50.0, 62.0, 90.0, 100.0])
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(now))
+    with progress.progress(Console(file=out)) as update:
+        for done in (0, 20, 31, 45, 50):
+            update("searches", done, 500, "")
+    assert out.getvalue().splitlines() == ["searches: 6 % (61 s, about 15 min left)", "searches: 10 % (99 s, about 15 min left)"]
 
 
 def test_a_label_that_is_used_again_begins_again() -> None:

@@ -1,4 +1,4 @@
-"""Progress of long work on standard error: a bar on a terminal, one line per tenth elsewhere."""
+"""Progress of long work on standard error: a bar on a terminal, elsewhere a line per tenth, or a minute after the last one."""
 
 import sys
 import time
@@ -9,6 +9,7 @@ from contextvars import ContextVar
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+SILENCE = 60.0  # [s]; the longest without a line, where anything is done meanwhile
 KEPT = 8  # finished bars that stay on a terminal
 Update = Callable[[str, int, int, str], None]  # label, done, total, figures
 _silent: ContextVar[bool] = ContextVar("silent", default=False)
@@ -37,18 +38,21 @@ def progress(shown_on: Console) -> Iterator[Update]:
     if not shown_on.is_terminal:
         shown: dict[str, int] = {}
         begun: dict[str, tuple[float, int]] = {}
+        said = time.monotonic()
 
         def line(label: str, done: int, total: int, figures: str = "") -> None:
+            nonlocal said
             now, tenth = time.monotonic(), 10 * done // max(total, 1)
             if tenth < shown.get(label, 0):
                 del shown[label], begun[label]
             since, before = begun.setdefault(label, (now, done))
-            if tenth > shown.get(label, 0):
-                shown[label] = tenth
+            if tenth > shown.get(label, 0) or now - said >= SILENCE:
+                percent = 10 * tenth if tenth > shown.get(label, 0) else 100 * done // max(total, 1)
+                shown[label], said = tenth, now
                 took = now - since
                 left = took * (total - done) / (done - before) if done > before else 0.0
                 times = f" ({lasting(took)}{f', about {lasting(left)} left' if left >= 60.0 else ''})" if took >= 1.0 else ""
-                shown_on.print(f"{label}: {10 * tenth} % {figures}".rstrip() + times, highlight=False, soft_wrap=True, markup=False)
+                shown_on.print(f"{label}: {percent} % {figures}".rstrip() + times, highlight=False, soft_wrap=True, markup=False)
 
         yield line
         return
