@@ -2,8 +2,8 @@
 
     python examples/ppo_one_file.py
 
-Nothing but gymnasium, numpy and torch. The environment resets a row in the step in which its episode ends (same_step), and gives the
-last observation of the old episode as info["final_obs"]: what a time limit cuts off is bootstrapped from it.
+Nothing but gymnasium, numpy and torch. The environment resets a row in the step in which its episode ends (same_step). The
+horizon counts as an end, so nothing is bootstrapped behind it.
 """
 
 import argparse
