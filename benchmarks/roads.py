@@ -40,7 +40,6 @@ DEFENCES = ("none", "kf", "rkf", "imm", "chi2_kf", "chi2_kf_sparse", "windowed_c
 DETECTORS = ("chi2_kf", "chi2_kf_sparse", "windowed_chi2_kf", "cusum_kf", "mewma_kf", "rkf", "imm")
 RECORDINGS = (("asta-string", "asta-braking"), ("comma2k19-radar",))  # of one rate each
 RESAMPLES, GAPS = 2000, (1.2, 3.0)  # time gaps [s] of the comparison with all else equal
-ONE_EVENT = 5.0  # alarms of all cars of a drive within this time are one event [s]
 
 
 def crashed(scenario: Scenario, defence: str, attack: str, dose: int, episodes: int) -> np.ndarray | None:
@@ -93,7 +92,7 @@ def part_alarms(options: argparse.Namespace) -> dict[str, Any]:
                 alarms, hours = alarms + row["alarms"], hours + row["hours"]
                 when.setdefault(name, []).extend(row["alarm_times"])
                 each[f"{name} {recording.name}".strip()] = {key: row[key] for key in ("alarms", "alarm_times", "hours", "alarm_share")}
-            events = sum(1 + int((np.diff(np.sort(times)) > ONE_EVENT).sum()) for times in when.values() if times)
+            events = sum(map(detect_log.events_of, when.values()))  # alarms of all cars of a drive
             low, high = mean_time(events, hours)
             out["defences"].setdefault(defence, {})[f"{dt:g}"] = {
                 "threshold": found["threshold"], "synthetic": found["measured"], "synthetic_fresh": found["fresh"], "alarms": alarms, "events": events, "hours": hours,

@@ -141,7 +141,7 @@ def test_the_command(tmp_path, capsys):
     mine = table.filter((table["defence"].to_numpy() == "chi2_kf") & (table["attack"].to_numpy() == "none"))
     assert mine.num_rows == 1200 and np.abs(np.diff(mine["t"].to_numpy()) - 0.1).max() < 1e-6
     assert main(arguments[:6]) == 0
-    assert "open loop; errors against a smoother" in capsys.readouterr().out
+    assert "open loop; alarms within 5 s count once" in capsys.readouterr().out
 
 
 @pytest.mark.long

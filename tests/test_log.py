@@ -19,11 +19,13 @@ from tailgate.core import draws
 from tailgate.core.kinds import Kind, Mode
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import Suite, load_suite
+from tailgate.envs.recorded import Recorded
 from tailgate.evaluation.cells import Cell
 from tailgate.evaluation.excluded_attacks import families
 from tailgate.play.trace import rollout
 from tailgate.studies import log
 from tailgate.studies.log import write_log
+from tailgate.studies.log_card import readme, recordings_of
 
 ATTACKS = ("none", "fdi:start_step=40,value=9,targets=[position]", "dropout:start_step=100", "fdi_ramp:start_step=20")
 SUITE = Suite("small", "Small.", ("thesis-ch4-v0",), (12, 30, 50), ("none", "chi2_kf"), ATTACKS, 9, held_out=("fdi_ramp",))
@@ -254,7 +256,17 @@ def test_the_card_and_the_schema_describe_every_column(made: tuple[Path, dict[st
     assert (units["reading_position"], units["innovation_velocity"], units["t"]) == ("m", "m/s", "s")
     for file in held["files"]:
         assert file["sha256"] in card and pq.ParquetFile(out / file["path"]).metadata.num_rows == file["rows"]
-    assert "CC0" in card and held["suite"] in card
+    assert "CC0" in card and held["suite"] in card and "nobody's data is in it" in card
+
+
+def test_the_card_names_recorded_drives() -> None:
+    """Their source and licence, that of a file too; nothing is then said to be all simulated."""
+    held = {"suite": "s", "about": "", "version": "0", "format": "f", "identity": "i", "held_out": [], "left_out": [], "files": [],
+            "defences": ["kf"], "doses": [1], "attacks": ["none"], "skipped": []}  # fmt: skip
+    scenario = {"about": "", "dt": 1, "horizon": 1, "agents": 1, "config_hash": "", "columns": []}
+    drives = Recorded(traces=("us06",), path=Path("x/own.csv"))
+    card = readme(held | {"scenarios": {"r": scenario | {"recordings": recordings_of(drives)}, "s": scenario | {"recordings": recordings_of(None)}}})
+    assert all(part in card for part in ("**us06**", "fastsim", "Apache-2.0", "**own.csv**")) and "nobody's data" not in card
 
 
 @pytest.mark.long

@@ -53,6 +53,16 @@ def test_an_address_that_another_car_gets_is_another_track(tmp_path):
     assert found.samples == 400 and found.segments[0].begin == pytest.approx(20.0) and np.abs(found.segments[0].gap - 40.0 - logs.GAP[200:]).max() < 2e-3
 
 
+def test_a_hole_in_the_own_speed_is_a_hole_in_time(tmp_path):
+    """It is the input of every defence: nothing is interpolated across it."""
+    can = logs.comma(tmp_path) / "processed_log" / "CAN" / "speed"
+    kept = (logs.T < 20.0) | (logs.T > 40.0)
+    logs.save(can / "t", logs.T[kept])
+    logs.save(can / "value", logs.OWN[kept])
+    (found,) = read(str(tmp_path))
+    assert found.repairs == {"holes in time": 1} and [round(part.begin, 6) for part in found.segments] == [0.0, 40.1]
+
+
 def test_a_silent_or_oncoming_sender_is_not_seen(tmp_path):
     lines = [json.loads(line) for line in logs.veremi().splitlines()]
     quiet = [line for line in lines if line["type"] == 2 or not 10.0 < line["rcvTime"] < 30.0]
@@ -77,6 +87,32 @@ def test_short_trajectories_among_others_are_dropped_and_counted(tmp_path):
     short = [line.replace("7,", "8,", 1) for line in logs.ultra_av().splitlines()[1:16]]
     (found,) = _read(tmp_path, "ultra-av", logs.ultra_av() + "\n".join(short) + "\n")
     assert found.samples == len(logs.T) and found.repairs == {"recordings below 5 s or 20 samples dropped": 1}
+
+
+ROUGH = {  # distance of samples [s], rounding of the times [s]
+    "60 Hz in ms": (1 / 60, 1e-3), "15 Hz in hundredths": (1 / 15, 1e-2), "exact 60 Hz": (1 / 60, 0.0), "exact 30 Hz": (1 / 30, 0.0),
+    "30 Hz in ms": (1 / 30, 1e-3),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ROUGH)
+def test_times_that_are_rounded_keep_their_samples(name):
+    """A rounded distance of samples does not add up over ten minutes, and even times are not smoothed."""
+    dt, grain = ROUGH[name]
+    t = dt * np.arange(round(600.0 / dt))
+    told = np.round(t / grain) * grain if grain else t
+    noise = np.random.default_rng(0).standard_normal(len(t))
+    found = checked(Raw("", told, 30.0 + 0.15 * noise, 0.0 * t, 20.0 + 0.0 * t), "here")
+    gap = found.segments[0].gap
+    assert found.samples == len(t) and abs(found.dt - dt) < 1e-6
+    assert np.corrcoef(gap, noise)[0, 1] > 0.98 and abs(gap.std() / (0.15 * noise.std()) - 1.0) < 0.05
+    assert grain or found.repairs == {}
+
+
+def test_a_sample_too_many_is_no_traceback():
+    t = np.sort(np.append(0.1 * np.arange(200), 5.05))
+    found = checked(Raw("", t, 30.0 + 0.1 * np.sin(t), 0.0 * t, 20.0 + 0.0 * t), "here")
+    assert found.samples == 200 and found.dt == 0.1
 
 
 def test_repairs_are_counted():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 from tailgate.base.errors import InputError
@@ -55,6 +56,11 @@ def _detect(options: argparse.Namespace) -> int:
         raise InputError("--length", options.length, "a number from 0 to 100 m")
     plot, parquet = picture("--plot", options.plot), written("--parquet", options.parquet)
     choice = Choice(options.vehicle, options.lead, options.length, mapping_of(options.map))
+    for option, path in (("--parquet", parquet), ("--plot", plot)):
+        if path is not None and path.exists() and Path(options.file).exists() and path.samefile(options.file):
+            raise InputError(option, str(path), "another file than the recording")
+    if parquet is not None and parquet.suffix != ".parquet":
+        raise InputError("--parquet", str(parquet), "a file name that ends in .parquet")
     recordings = read(options.file, options.format, choice)
     if bare := [f"{what}={column}" for what, column, unit in choice.mapping if not unit and what != "t"]:
         tell(f"no unit is named in {', '.join(bare)}: m or m/s is taken. A unit follows a colon, as in gap=dist:ft")
@@ -92,10 +98,13 @@ def _tables(rows: list[dict[str, Any]]) -> None:
             f"{100 * row['alarm_share']:.1f} %", _text(row["gap_error"], 3), _text(row["speed_error"], 3), detected,
             _text(row["delay"]) if "delay" in row else "",
         ))  # fmt: skip
-    table(heads, lines, "replayed in the open loop; errors against a smoother", numbers=(3, 4, 6, 7, 8, 10))
+    table(heads, lines, "replayed in the open loop; alarms within 5 s count once; errors against a smoother", numbers=(3, 4, 6, 7, 8, 10))
     for row in good:
         for what, count in row["repairs"].items() if row["attack"] == "none" else ():
             say(f"{row['recording']}: {count} {what}")
+    silent = {row["recording"]: row["missing_share"] for row in good if row["attack"] == "none" and row["missing_share"] >= 0.01}
+    for name, share in silent.items():
+        say(f"{name}: {100 * share:.0f} % of the steps have no reading; they count neither as time nor in the errors")
     for row in rows:
         if row["status"] == "skipped":
             say(f"{row['recording']}: {row['defence']} against {row['attack']} is left out: {row['reason']}")

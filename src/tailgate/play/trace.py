@@ -71,6 +71,28 @@ class Trace:
         """The steps that belong to each episode, (K, B) bool."""
         return np.arange(len(self.kind))[:, None] < self.length
 
+    def road(self, name: str, row: int = 0) -> Array:
+        """Return a road signal of one episode (K + 1, N): before the first step, then after each."""
+        n = int(self.length[row])
+        return np.concatenate([self.first[name][row : row + 1], self.signals[name][:n, row]])
+
+    def believed_gap(self, row: int = 0) -> Array:
+        """Return the gap that each agent of one episode believes (K, N) [m]; in a lane, the room to its nearer line.
+
+        If the state is a position, the believed gap is the leader's position as received, less the estimated position.
+        """
+        model, n = self.model, int(self.length[row])
+        assert model.gap is not None
+        estimate = self.estimate[:n, row]
+        if model.lane or model.agents > 1 or model.air:
+            gap = np.stack([x @ rows for x, rows in zip(np.moveaxis(estimate, 1, 0), model.gap, strict=True)], axis=1)
+            return np.asarray(model.lane - np.abs(gap) if model.lane else gap)
+        if "leader_position" in model.v2v:
+            leader = self.wires[:n, row, :, model.wires.index("leader_position")]
+        else:
+            leader = (self.road("position", row) + self.road("gap", row))[:-1]
+        return np.asarray(leader - estimate[..., 0])
+
     def _hash(self, row: int, names: list[str]) -> str:
         digest = hashlib.blake2b(digest_size=16)
         n = int(self.length[row])

@@ -60,30 +60,6 @@ def _hit(replay: Replay) -> Array:
     return np.asarray(trace.target[:, 0] & (trace.kind[:, 0] != Kind.NONE)[:, None, None])
 
 
-def _road(replay: Replay, name: str, agent: int) -> Array:
-    """Return a road signal of an agent (K + 1,): before the first step, then after each."""
-    trace = replay.trace
-    return np.concatenate([trace.first[name][:, agent], trace.signals[name][:, 0, agent]])
-
-
-def _believed_gap(replay: Replay, agent: int) -> Array:
-    """Return the gap that the agent believes (K,) [m].
-
-    If the state is a position, the believed gap is the leader's position as received, less the estimated position.
-    """
-    trace, model = replay.trace, replay.loop.model
-    assert model.gap is not None
-    if model.lane:
-        return np.asarray(model.lane - np.abs(trace.estimate[:, 0, agent] @ model.gap[agent]))
-    if model.agents > 1 or model.air:
-        return np.asarray(trace.estimate[:, 0, agent] @ model.gap[agent])
-    if "leader_position" in model.v2v:
-        leader = trace.wires[:, 0, agent, model.wires.index("leader_position")]
-    else:
-        leader = (_road(replay, "position", agent) + _road(replay, "gap", agent))[:-1]
-    return np.asarray(leader - trace.estimate[:, 0, agent, 0])
-
-
 def _wires(replay: Replay) -> list[Data]:
     """Return the attacked wires with the kinds that hit them; of very many, those of an agent together."""
     hit = _hit(replay)
@@ -137,7 +113,7 @@ def _of_agent(replay: Replay, agent: int) -> Data:
     trace, model, follows = replay.trace, replay.loop.model, bool(replay.loop.model.followers[agent])
     limit = threshold(replay.loop.defence) or _energy_threshold(replay)
     score, alarm, gate = trace.score[:, 0, agent], trace.alarm[:, 0, agent], replay.gate[:, agent]
-    rear = _road(replay, "rear_gap", agent)
+    rear = trace.road("rear_gap")[:, agent]
     out: Data = {
         "road": None, "rear": None, "desired": None, "believed": None, "errors": _errors(replay, agent),
         "score": curve(score), "alarm": alarm.astype(int).tolist(), "mode": trace.mode[:, 0, agent].tolist(),
@@ -149,10 +125,10 @@ def _of_agent(replay: Replay, agent: int) -> Data:
         assert model.speed is not None
         speed = trace.estimate[:, 0, agent] @ model.speed[agent]
         out |= {
-            "road": {name: curve(_road(replay, name, agent)) for name in ("gap", "speed", "lead_speed", "position")},
-            "rear": {name: curve(_road(replay, name, agent)) for name in ("rear_gap", "rear_speed")} if np.isfinite(rear).any() else None,
-            "desired": curve(np.asarray(trace.desired_gap(_road(replay, "speed", agent)))),
-            "believed": {"gap": curve(_believed_gap(replay, agent)), "speed": curve(np.asarray(speed))},
+            "road": {name: curve(trace.road(name)[:, agent]) for name in ("gap", "speed", "lead_speed", "position")},
+            "rear": {name: curve(trace.road(name)[:, agent]) for name in ("rear_gap", "rear_speed")} if np.isfinite(rear).any() else None,
+            "desired": curve(np.asarray(trace.desired_gap(trace.road("speed")[:, agent]))),
+            "believed": {"gap": curve(trace.believed_gap()[:, agent]), "speed": curve(np.asarray(speed))},
         }
     if model.actuators and (follows or model.agents == 1):
         commanded, applied = trace.control[:, 0, agent, 0], trace.applied[:, 0, agent, 0]
@@ -164,11 +140,11 @@ def _in_lane(replay: Replay) -> Data:
     """Return the curves of the picture of a lane: K + 1 places and headings of the car, and K errors of the belief."""
     trace, half = replay.trace, replay.loop.model.lane
     truth, off = trace.truth[:, 0, 0], trace.estimate[:, 0, 0] - trace.truth[:, 0, 0]
-    gap = _road(replay, "gap", 0)
+    gap = replay.trace.road("gap")[:, 0]
     last = np.copysign(half - gap[-1], truth[-1, 0])  # a trace holds the state up to the last measurement
-    speed = _road(replay, "speed", 0)
+    speed = replay.trace.road("speed")[:, 0]
     turn = np.concatenate([truth[:, 3], truth[-1:, 3]])
-    bend = (_road(replay, "accel", 0) / speed - turn) / speed  # the lateral acceleration is v (e_psi' + v kappa)
+    bend = (replay.trace.road("accel")[:, 0] / speed - turn) / speed  # the lateral acceleration is v (e_psi' + v kappa)
     bend[-1] = bend[-2] if len(bend) > 1 else bend[-1]
     return {
         "half": half, "offset": curve(np.append(truth[:, 0], last)), "heading": curve(np.append(truth[:, 2], truth[-1, 2])),
@@ -187,7 +163,7 @@ def _radar(replay: Replay, agent: int) -> Data:
     return {
         "muted": (~sent).astype(int).tolist(), "energy": curve(_decibels(trace.energy[:, 0, agent])),
         "threshold": None if limit is None else float(_decibels(np.asarray(limit[1]))),
-        "then": curve(_road(replay, "gap", agent)[:-1]),
+        "then": curve(replay.trace.road("gap")[:, agent][:-1]),
     }  # fmt: skip
 
 
@@ -237,12 +213,12 @@ def _everybody(replay: Replay, agents: list[int]) -> Data:
     if model.followers.any():
         cars = range(model.agents)
         out["string"] = {
-            "gap": [curve(_road(replay, "gap", i)) for i in cars], "speed": [curve(_road(replay, "speed", i)) for i in cars],
-            "position": curve(_road(replay, "position", 0)),
-            "believed": [curve(_believed_gap(replay, i)) if model.followers[i] else [] for i in cars],
+            "gap": [curve(replay.trace.road("gap")[:, i]) for i in cars], "speed": [curve(replay.trace.road("speed")[:, i]) for i in cars],
+            "position": curve(replay.trace.road("position")[:, 0]),
+            "believed": [curve(replay.trace.believed_gap()[:, i]) if model.followers[i] else [] for i in cars],
         }  # fmt: skip
         if model.followers[0]:  # the leader is no agent
-            out["string"]["lead"] = curve(_road(replay, "lead_speed", 0))
+            out["string"]["lead"] = curve(replay.trace.road("lead_speed")[:, 0])
     else:
         places = layout(model.graph)
         low, wide = places.min(axis=0), np.ptp(places, axis=0)

@@ -39,7 +39,7 @@ def check_format(path: Path) -> None:
 
 def pace(dt: float, length: int, most: float = math.inf) -> tuple[int, float]:
     """Return (steps per frame, frames a second): real time, but every step of an episode shorter than ten seconds."""
-    stride = 1 if length * dt < SHORTEST else max(1, round(1.0 / (dt * FASTEST)), math.ceil(length / most))
+    stride = 1 if length * dt < SHORTEST else max(1, math.ceil(1.0 / (dt * FASTEST) - 1e-9), math.ceil(length / most))
     return stride, min(1.0 / (dt * stride), float(FASTEST))
 
 

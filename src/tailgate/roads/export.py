@@ -1,7 +1,8 @@
-"""An episode in the field's formats: CSV and Parquet (PlotJuggler, pandas), and SUMO's floating car data.
+"""An episode in the field's formats: CSV and Parquet (pandas, PlotJuggler), and SUMO's floating car data.
 
-A row is one car at one time: what it read, believed and did, and where it was. Cars are named agent0, agent1, ...; where the manoeuvre's
-car is no agent, it is `leader`, and the driver behind `behind`. They have rows for the road alone.
+A row is one time, at which readings arrive. The last one is the road after the last step. `agent0/gap` is a column: a car, and its gap.
+Cars are agent0, agent1, ...; where the manoeuvre's car is no agent, it is `leader`, and the driver behind `behind`. Where another car takes
+that place, as in traffic, it is `leader1`, and so on. They have columns for the road alone.
 """
 
 from __future__ import annotations
@@ -22,14 +23,15 @@ from tailgate.roads.fcd import fcd
 from tailgate.studies.log import pyarrow
 
 SUFFIXES = (".csv", ".xml", ".parquet")
+JUMP = 2.0  # from one step to the next, beyond its own way: another car has taken the place [m]
 LENGTH = 5.0  # of a car, which SUMO needs: positions of a plant are such that their differences are gaps [m]
 
 
 class Cars(NamedTuple):
-    """The road of one episode, (K, V) each: the first car first, at the times of its K steps."""
+    """The road of one episode, (K + 1, V) each: the first car first, before each of its K steps and at its end."""
 
     names: tuple[str, ...]
-    place: Array  # front bumper along the lane [m]
+    place: Array  # front bumper along the lane [m]; NaN where the car is not there
     speed: Array  # [m/s]
     accel: Array  # [m/s^2]
     gap: Array  # to the car ahead [m]; NaN where there is none
@@ -43,10 +45,14 @@ def check_path(path: Path) -> None:
         pyarrow()
 
 
-def _road(trace: Trace, name: str, row: int) -> Array:
-    """Return a road signal (K, N) at the times of the steps."""
-    n = int(trace.length[row])
-    return np.concatenate([trace.first[name][row : row + 1], trace.signals[name][: n - 1, row]])
+def _others(name: str, place: Array, speed: Array, dt: float) -> list[tuple[str, Array, Array, Array]]:
+    """Return name, place, speed and acceleration (K,) of each car that takes a place on the road, NaN where another one has it."""
+    accel = np.diff(speed, prepend=speed[:1]) / dt
+    other = np.abs(np.diff(place) - 0.5 * dt * (speed[1:] + speed[:-1])) > JUMP
+    number = np.concatenate([[0], np.cumsum(other)])
+    accel[1:][other] = 0.0
+    mine = [(f"{name}{i or ''}", number == i) for i in range(number[-1] + 1)]
+    return [(car, *(np.where(here, column, np.nan) for column in (place, speed, accel))) for car, here in mine]  # type: ignore[misc]
 
 
 def cars_of(trace: Trace, row: int = 0) -> Cars:
@@ -56,68 +62,53 @@ def cars_of(trace: Trace, row: int = 0) -> Cars:
         raise InputError("--export", "a car in a lane", "an episode of cars that follow each other; tailgate log writes the others")
     if not model.followers.any():
         raise InputError("--export", "a system without a road", "an episode of cars; tailgate log writes the others")
-    x, v, a, gap, ahead = (_road(trace, name, row) for name in ("position", "speed", "accel", "gap", "lead_speed"))
-    names = [f"agent{i}" for i in range(model.agents)]
+    x, v, a, gap, ahead = (trace.road(name, row) for name in ("position", "speed", "accel", "gap", "lead_speed"))
     place = x - LENGTH * np.arange(model.agents)
     gap = np.where(np.isfinite(gap), gap, np.nan)
+    nobody = np.full(len(x), np.nan)
+    cars = [(f"agent{i}", place[:, i], v[:, i], a[:, i], gap[:, i]) for i in range(model.agents)]
     if model.followers[0]:  # the car ahead of the first is no agent
-        lead = (x[:, 0] + gap[:, 0] + LENGTH, ahead[:, 0], np.gradient(ahead[:, 0], model.dt), np.full(len(x), np.nan))
-        names = ["leader", *names]
-        place, v, a, gap = (np.concatenate([first[:, None], rest], axis=1) for first, rest in zip(lead, (place, v, a, gap), strict=True))
-    rear = _road(trace, "rear_gap", row)[:, -1]
+        cars = [(*lead, nobody) for lead in _others("leader", x[:, 0] + gap[:, 0] + LENGTH, ahead[:, 0], model.dt)] + cars
+    rear = trace.road("rear_gap", row)[:, -1]
     if np.isfinite(rear).all():
-        last = (place[:, -1] - LENGTH - rear, _road(trace, "rear_speed", row)[:, -1])
-        names.append("behind")
-        columns = (last[0], last[1], np.gradient(last[1], model.dt), rear)
-        place, v, a, gap = (np.concatenate([rest, one[:, None]], axis=1) for rest, one in zip((place, v, a, gap), columns, strict=True))
-    return Cars(tuple(names), place, v, a, gap)
+        behind = _others("behind", place[:, -1] - LENGTH - rear, trace.road("rear_speed", row)[:, -1], model.dt)
+        cars += [(*last, np.where(np.isfinite(last[1]), rear, np.nan)) for last in behind]
+    names, *columns = zip(*cars, strict=True)
+    return Cars(names, *(np.stack(column, axis=1) for column in columns))
 
 
 def table_of(trace: Trace, row: int = 0) -> dict[str, Array]:
-    """Return columns of one length: step by step, in it car by car. Numbers that a car does not have are NaN, texts empty."""
+    """Return columns of one length, a row for each step and one for the end. Numbers that a row does not have are NaN, texts empty."""
     cars, model, n = cars_of(trace, row), trace.model, int(trace.length[row])
-    count = len(cars.names)
-    agents = np.array([int(name[5:]) if name.startswith("agent") else -1 for name in cars.names])
-
-    def spread(values: Array) -> Array:
-        """Return an agent's numbers (K, N) as those of all cars (K V,)."""
-        out = np.full((n, count), np.nan)
-        out[:, agents >= 0] = values[:, agents[agents >= 0]]
-        return out.ravel()
-
-    def words(values: Array) -> Array:
-        out = np.full((n, count), "", dtype=object)
-        out[:, agents >= 0] = values[:, agents[agents >= 0]]
-        return out.ravel()
-
     held = {name: trace.signals[name][:n, row] for name in ("wires", "valid", "estimate", "control", "applied", "score", "alarm", "mode")}
     hit = trace.target[:n, row] & (trace.kind[:n, row] != Kind.NONE)[:, None, None]
-    kinds = np.array([kind.name.lower() for kind in Kind])[trace.kind[:n, row]]
-    t = model.dt * np.arange(n)
-    out: dict[str, Array] = {
-        "t": np.repeat(t, count), "vehicle": np.tile(np.array(cars.names, dtype=object), n), "position": cars.place.ravel(),
-        "speed": cars.speed.ravel(), "acceleration": cars.accel.ravel(), "gap": cars.gap.ravel(),
-    }  # fmt: skip
-    for i, name in enumerate(model.sensors + model.v2v):
-        values = held["wires"][..., i]
-        out[f"received_{name}"] = spread(np.where(held["valid"][..., i], values, np.nan) if i < len(model.sensors) else values)
-    assert model.gap is not None and model.speed is not None
-    for name, rows in (("gap", model.gap), ("speed", model.speed)):
-        out[f"believed_{name}"] = spread(_rowwise(rows, held["estimate"]))
-    for i, name in enumerate(model.actuators):
-        out[f"command_{name}"], out[f"applied_{name}"] = spread(held["control"][..., i]), spread(held["applied"][..., i])
-    out |= {"score": spread(held["score"]), "alarm": spread(held["alarm"].astype(float))}
-    out["mode"] = words(np.array([mode.name.lower() for mode in Mode])[held["mode"]])
-    out["attack"] = words(np.where(hit.any(axis=2), kinds[:, None], "none"))
-    for i, name in enumerate(model.wires):
-        if hit[..., i].any():
-            out[f"attacked_{name}"] = spread(hit[..., i].astype(float))
-    return out
+    kinds = np.where(hit.any(axis=2), np.array([kind.name.lower() for kind in Kind])[trace.kind[:n, row]][:, None], "none")
+    modes = np.array([mode.name.lower() for mode in Mode])[held["mode"]]
+    assert model.speed is not None
+    believed = {"gap": trace.believed_gap(row), "speed": (model.speed[None] * held["estimate"]).sum(axis=2)}
 
+    def numbers(values: Array) -> Array:
+        return np.append(values.astype(float), np.nan)
 
-def _rowwise(rows: Array, x: Array) -> Array:
-    """Return row i of `rows` (N, n) times x (K, N, n) of agent i: (K, N)."""
-    out: Array = (rows[None] * x).sum(axis=2)
+    def words(values: Array) -> Array:
+        return np.append(values.astype(object), "")
+
+    out: dict[str, Array] = {"t": model.dt * np.arange(n + 1)}
+    for i, name in enumerate(cars.names):
+        road = {"position": cars.place, "speed": cars.speed, "acceleration": cars.accel, "gap": cars.gap}
+        out |= {f"{name}/{what}": values[:, i] for what, values in road.items()}
+    for i in range(model.agents):
+        mine: dict[str, Array] = {}
+        for w, name in enumerate(model.sensors + model.v2v):
+            values = held["wires"][:, i, w]
+            mine[f"received_{name}"] = np.where(held["valid"][:, i, w], values, np.nan) if w < len(model.sensors) else values
+        mine |= {f"believed_{name}": values[:, i] for name, values in believed.items()}
+        for w, name in enumerate(model.actuators):
+            mine |= {f"command_{name}": held["control"][:, i, w], f"applied_{name}": held["applied"][:, i, w]}
+        mine |= {"score": held["score"][:, i], "alarm": held["alarm"][:, i]}
+        mine |= {f"attacked_{name}": hit[:, i, w] for w, name in enumerate(model.wires)}
+        out |= {f"agent{i}/{name}": numbers(values) for name, values in mine.items()}
+        out |= {f"agent{i}/mode": words(modes[:, i]), f"agent{i}/attack": words(kinds[:, i])}
     return out
 
 
@@ -125,7 +116,7 @@ def exported(trace: Trace, suffix: str, row: int = 0) -> bytes:
     """Return an episode as the content of a file with a suffix of SUFFIXES."""
     if suffix == ".xml":
         cars = cars_of(trace, row)
-        return fcd(trace.model.dt, cars.names, cars.place - min(0.0, float(cars.place.min())), cars.speed, cars.accel)
+        return fcd(trace.model.dt, cars.names, cars.place - min(0.0, float(np.nanmin(cars.place))), cars.speed, cars.accel)
     columns = table_of(trace, row)
     if suffix == ".parquet":
         pa, pq = pyarrow()

@@ -26,7 +26,6 @@ class _Reader:
         self.name, self.time, self.depth, self.rows = name, float("nan"), 0, 0
         self.root = ""
         self.seen: dict[str, dict[float, tuple[str, float, float]]] = {}
-        self.times: list[float] = []
 
     def refuse(self, *_: object) -> None:
         raise InputError(f"{self.name}: XML", "a document type", "none: entities could read files or grow without bound")
@@ -39,8 +38,9 @@ class _Reader:
         if self.depth > DEEPEST:
             raise InputError(f"{self.name}: XML", f"{self.depth} nested elements", f"at most {DEEPEST}")
         if tag == "timestep":
-            self.time = self.number(given, "time", tag)
-            self.times.append(self.time)
+            before, self.time = self.time, self.number(given, "time", tag)
+            if self.time <= before:
+                raise InputError(f"{self.name}: timestep.time", self.time, f"a time after {before:g} s")
         elif tag == "vehicle":
             if "id" not in given or "lane" not in given:
                 raise InputError(f"{self.name}: vehicle at {self.time:g} s", sorted(given), "id, lane, pos and speed")
@@ -124,13 +124,15 @@ def fcd(dt: float, names: Iterable[str], place: Array, speed: Array, accel: Arra
     Parameters
     ----------
     place, speed, accel : (K, V)
-        Place of the front bumper along the lane [m], speed [m/s] and acceleration [m/s^2] of each car.
+        Place of the front bumper along the lane [m], speed [m/s] and acceleration [m/s^2] of each car; NaN where it is not there.
     """
     out = ['<?xml version="1.0" encoding="UTF-8"?>', "<fcd-export>"]
     ids = [quoteattr(name) for name in names]
     for k in range(len(place)):
         out.append(f'    <timestep time="{k * dt:.3f}">')
         for i, name in enumerate(ids):
+            if np.isnan(place[k, i]):
+                continue
             x = f"{place[k, i]:.3f}"
             out.append(
                 f'        <vehicle id={name} x="{x}" y="0.00" angle="90.00" type="car" speed="{speed[k, i]:.4f}" pos="{x}" '

@@ -56,6 +56,9 @@ def windows_of(settings: Settings) -> tuple[Windows, Windows]:
     """Return the windows to fit and the unseen ones: every other one each."""
     cut: list[tuple[Array, Array]] = []
     rates = set()
+    names = [name for name, _ in settings.traces]
+    if again := [name for i, name in enumerate(names) if name in names[:i]]:
+        raise InputError("fit.traces", again[0], "each recording once, else an unseen window could be a fitted one")
     for name, begin in settings.traces:
         columns = trace(name, "fit.traces")
         cars = sum(key.startswith("speed") for key in columns)
@@ -68,7 +71,7 @@ def windows_of(settings: Settings) -> tuple[Windows, Windows]:
         size, first = round(settings.window / dt), round(begin / dt)
         cut += [(speed[at : at + size], gap[at : at + size]) for at in range(first, len(speed) - size + 1, size)]
     if len(rates) > 1 or len({speed.shape for speed, _ in cut}) > 1:
-        raise InputError("fit.traces", [name for name, _ in settings.traces], "recordings of as many cars and of one rate")
+        raise InputError("fit.traces", names, "recordings of as many cars and of one rate")
     if len(cut) < 2:
         raise InputError("fit.window", settings.window, "at most half of the recording: windows to fit and to show")
     (rate,) = rates

@@ -26,6 +26,7 @@ from tailgate.core import Array
 from tailgate.core.traces import cards, npy, trace
 from tailgate.roads.fcd import read_fcd
 from tailgate.roads.recording import FEWEST, LEAST, MOST, Raw, Recording, checked
+from tailgate.roads.recording import SILENCE as HOLE
 
 FORMATS = ("openacc", "ultra-av", "comma2k19", "sumo-fcd", "veremi", "csv", "trace")
 TIMES, LENGTHS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}, {"m": 1.0, "km": 1000.0, "ft": 0.3048}
@@ -53,7 +54,7 @@ class Choice:
 
 def mapping_of(texts: Sequence[str]) -> tuple[tuple[str, str, str], ...]:
     """Return what, column and unit, empty where none is named, of texts such as `speed=v_ego:km/h`. Raise InputError for anything else."""
-    out = []
+    out: list[tuple[str, str, str]] = []
     for text in texts:
         what, sep, rest = text.partition("=")
         column, _, unit = rest.rpartition(":") if rest.rpartition(":")[2] in UNITS else (rest, "", "")  # a column's name may have a colon
@@ -63,6 +64,8 @@ def mapping_of(texts: Sequence[str]) -> tuple[tuple[str, str, str], ...]:
             raise unknown("--map", what, WANTED)
         if unit and unit not in WANTED[what]:
             raise unknown(f"--map: unit of {what}", unit, WANTED[what])
+        if any(what == other for other, _, _ in out):
+            raise InputError("--map", text, f"{what} once")
         out.append((what, column, unit))
     return tuple(out)
 
@@ -150,7 +153,7 @@ class Table:
         out = np.empty(len(self.columns[column]))
         for i, text in enumerate(self.columns[column]):
             try:
-                out[i] = float(text) if text or not empty_is_nan else np.nan
+                out[i] = float(text.replace("_", "?")) if text or not empty_is_nan else np.nan  # Python reads 3_0 as 30
             except ValueError:
                 raise InputError(f"{self.name}, line {self.first + i}, column {column}", text, "a number") from None
         return out
@@ -273,7 +276,9 @@ def _comma(path: Path, choice: Choice) -> list[Raw]:
         tracks.append((address, begun[address]))
     long = Counter(track for track in tracks if choice.vehicle in (None, str(track[0])))
     chosen = max(long, key=lambda track: (long[track], -track[0], -track[1]))
-    mine = np.array([track == chosen for track in tracks]) & (t >= at[0]) & (t <= at[-1])
+    known = (t >= at[0]) & (t <= at[-1])
+    known[known] = np.diff(at)[np.clip(np.searchsorted(at, t[known], "right") - 1, 0, len(at) - 2)] <= HOLE  # else a hole in time
+    mine = np.array([track == chosen for track in tracks]) & known
     return [Raw(f"track {chosen[0]}", t[mine], values[mine, 0], values[mine, 2], np.interp(t[mine], at, speed))]
 
 

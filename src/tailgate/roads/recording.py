@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -98,16 +99,18 @@ def checked(raw: Raw, where: str) -> Recording:
         repairs["repeated times dropped"] = int(again.sum())
         raw = Raw(raw.name, *(column[~again] for column in raw[1:]))
         t, step = raw.t, np.diff(raw.t)
-    dt = round(float(np.median(step)), 6)
-    if not RATE[0] <= dt <= RATE[1]:
-        raise InputError(f"{name}: time between samples", dt, f"{RATE[0]:g} to {RATE[1]:g} s; is the unit a second?")
+    usual = round(float(np.median(step)), 6)
+    if not RATE[0] <= usual <= RATE[1]:
+        raise InputError(f"{name}: time between samples", usual, f"{RATE[0]:g} to {RATE[1]:g} s; is the unit a second?")
     raw = _possible(raw, name, repairs)
-    longest = max(BREAK * dt, SILENCE + 1e-6)
+    longest = max(BREAK * usual, SILENCE + 1e-6)
     holes = np.flatnonzero(step > longest) + 1
     if len(holes):
         repairs["holes in time"] = len(holes)
+    parts = np.split(np.arange(len(t)), holes)
+    dt = _distance(t, parts, usual)
     segments = []
-    for part in np.split(np.arange(len(t)), holes):
+    for part in parts:
         if (part[-1] - part[0]) * dt < LEAST:
             repairs["samples of short segments dropped"] = repairs.get("samples of short segments dropped", 0) + len(part)
             continue
@@ -148,16 +151,27 @@ def _possible(raw: Raw, name: str, repairs: dict[str, int]) -> Raw:
     return Raw(raw.name, raw.t, gap, relative, np.maximum(speed, 0.0))
 
 
+def _distance(t: Array, parts: Sequence[Array], usual: float) -> float:
+    """Return the distance of samples [s]: the usual one or the mean, whichever the times are nearer to multiples of."""
+    steps: Array = np.concatenate([np.diff(t[part]) for part in parts])
+    mean = round(float(steps[steps <= BREAK * usual].mean()), 9)
+
+    def off(dt: float) -> float:
+        return float(np.mean(np.concatenate([np.abs((t[part] - t[part[0]] + 0.5 * dt) % dt - 0.5 * dt) for part in parts])))
+
+    return min(usual, mean, key=off)
+
+
 def _uniform(raw: Raw, part: Array, dt: float, repairs: dict[str, int]) -> Segment:
-    """Return the samples of a segment on a grid of dt [s]; where samples are lost, the own speed is interpolated."""
+    """Return the samples of a segment on a grid of about dt [s]; where samples are lost, the own speed is interpolated."""
     t = raw.t[part]
     count = round(float((t[-1] - t[0]) / dt)) + 1
-    grid = t[0] + dt * np.arange(count)
-    columns = [raw.gap[part], raw.relative_speed[part], raw.speed[part]]
+    grid, dt = np.linspace(t[0], t[-1], count, retstep=True)  # so that a rounded dt does not add up
+    columns: list[Array] = [raw.gap[part], raw.relative_speed[part], raw.speed[part]]
     places = np.rint((t - t[0]) / dt).astype(np.int64)
     if np.abs(t - t[0] - dt * places).max() > 1e-6 + 0.02 * dt:
         repairs["samples interpolated to even times"] = repairs.get("samples interpolated to even times", 0) + count
-    if count > len(t) or np.abs(t - grid[: len(t)]).max() > 1e-6 + 0.02 * dt:
+    if count != len(t) or np.abs(t - grid).max() > 1e-6 + 0.02 * dt:
         columns = [np.interp(grid, t, column) for column in columns]  # a missing neighbour leaves NaN
     before = np.clip(np.searchsorted(t, grid, "right") - 1, 0, len(t) - 2)
     lost = (t[before + 1] - t[before] > BREAK * dt) & (np.minimum(grid - t[before], t[before + 1] - grid) > 0.5 * dt)

@@ -33,7 +33,7 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, Suite, load_suite
 from tailgate.evaluation.cells import Cell, cell_id, cells_of
 from tailgate.evaluation.excluded_attacks import families
-from tailgate.studies.log_card import Column, columns_of, readme
+from tailgate.studies.log_card import Column, columns_of, readme, recordings_of
 
 FORMAT = "tailgate-log-1"
 SPLITS = {"train": "train", "dev": "tune"}  # and the purpose of its seeds
@@ -164,7 +164,7 @@ def _written(
         "scenarios": {
             name: {
                 "about": scenario.about, "config_hash": scenario.config_hash, "dt": model.dt,
-                "horizon": scenario.horizon, "agents": model.agents,
+                "horizon": scenario.horizon, "agents": model.agents, "recordings": recordings_of(scenario.manoeuvre),
                 "columns": [column._asdict() for column in described],
             }
             for name, (scenario, model, described) in columns.items()

@@ -9,6 +9,7 @@ import numpy as np
 from tailgate.core import draws
 from tailgate.core.draws import Draws
 from tailgate.core.loop import Loop
+from tailgate.core.traces import cards
 
 LICENCE = "CC0-1.0"
 Role = Literal["key", "input", "defence", "label", "truth"]
@@ -90,6 +91,15 @@ def columns_of(loop: Loop) -> list[Column]:
     return [*out, Column("truth_collided", "bool_", "", "truth", "somebody collided in this step, the episode's last where that ends it")]
 
 
+def recordings_of(manoeuvre: object) -> list[dict[str, str]]:
+    """Return name, source, licence and attribution of the recorded drives that a manoeuvre plays."""
+    named = [cards()[name] for name in getattr(manoeuvre, "traces", ()) if name in cards()]
+    out = [{key: getattr(card, key) for key in ("name", "source", "licence", "attribution")} for card in named]
+    if path := getattr(manoeuvre, "path", None):
+        out.append({"name": path.name, "source": "a file given with the scenario", "licence": "that of the file", "attribution": ""})
+    return out
+
+
 def _one_row() -> Draws:
     return draws.keys("train", [0]).at(draws.Role.PRIOR, np.zeros(1, np.int64))
 
@@ -97,11 +107,18 @@ def _one_row() -> Draws:
 def readme(held: dict[str, Any]) -> str:
     """Return the data card (README.md) of a log, from what schema.json holds."""
     out = [f"# Episodes of {held['suite']}", "", held["about"] or "Simulated episodes.", ""]
+    recorded = {one["name"]: one for scenario in held["scenarios"].values() for one in scenario["recordings"]}
     out += [
-        f"Made by tailgate {held['version']}, format {held['format']}, identity {held['identity']}. Everything is simulated: nobody's "
-        "data is in it.",
+        f"Made by tailgate {held['version']}, format {held['format']}, identity {held['identity']}. "
+        + ("The speed of the leader is recorded:" if recorded else "Everything is simulated: nobody's data is in it."),
         "",
-        f"One row per step and agent, in the order of cell, episode, step and agent; one row group or more per cell. Licence: {LICENCE}.",
+    ]
+    for one in recorded.values():
+        out.append(f"- **{one['name']}**: {one['source']}. Licence: {one['licence']}. {one['attribution']}".rstrip())
+    out += [
+        *(["", "All else is simulated.", ""] if recorded else []),
+        f"One row per step and agent, in the order of cell, episode, step and agent; one row group or more per cell. "
+        f"Licence{' of what is simulated' if recorded else ''}: {LICENCE}.",
         "",
         "## What it is for",
         "",
