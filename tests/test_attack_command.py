@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from tailgate.base.errors import InputError
 from tailgate.cli import main
 from tailgate.core.scenario import Suite, load_suite
 from tailgate.ensemble import members, standard
@@ -82,7 +83,7 @@ def test_the_command(left_out, small_ensemble, tmp_path, capsys, monkeypatch):
         (["--budget", "huge"], "--budget: got 'huge'; expected one of"),
         (["--dose", "5"], "--dose: got 5; expected one of the suite's"), (["--dose", "much"], "--dose: got 'much'"),
         (["--scenario", "nowhere"], "--scenario: got 'nowhere'"), (["--suite", "nothing"], "suite: got 'nothing'"),
-        (["--seed", "-1"], "--seed: got -1"), (["--workers", "0"], "workers: got 0"), (["--episodes", "0"], "episodes: got 0"),
+        (["--seed", "-1"], "--seed: got -1"), (["--seed", str(2**32)], "--seed: got 4294967296"), (["--workers", "0"], "workers: got 0"), (["--episodes", "0"], "episodes: got 0"),
     ],
 )  # fmt: skip
 def test_bad_input_is_refused_before_anything_is_played(change, message, capsys, tmp_path):
@@ -91,6 +92,17 @@ def test_bad_input_is_refused_before_anything_is_played(change, message, capsys,
     assert main([*WORDS, *change, "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
     assert re.search(message, error) and error.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
+def test_a_place_that_is_named_twice_is_one(monkeypatch):
+    """Else its report episodes would count twice."""
+    suite = load_suite("radar-v0")
+    jobs = standard.jobs_of(suite, "chi2_kf", ["radar-braking-v0"] * 2, [4, 9, 4], "quick", 0)
+    assert [job.arena.dose for job in jobs] == [4, 9]
+    with pytest.raises(InputError, match=r"threat\.knowledge: got 'black'"):
+        standard.jobs_of(dataclasses.replace(suite, threat={"knowledge": "black"}), "chi2_kf", (), (), "quick", 0)
+    monkeypatch.setattr(standard, "find_spec", lambda _: None)  # members without torch are searched again with it
+    assert standard.jobs_of(suite, "chi2_kf", (), (), "quick", 0)[0].name != jobs[0].name
 
 
 def test_a_defence_without_a_meaning(capsys):

@@ -156,6 +156,18 @@ def test_numbers_lie_within_the_threat_model():
         assert len({space.text(genome) for genome in np.random.default_rng(4).random((50, len(GENES)))}) > 45
 
 
+def test_a_collision_that_ends_no_episode_is_damage():
+    place = dataclasses.replace(arena("car"), scenario="thesis-ch4-v0", defence="none", dose=None, threat={})
+    scripts = place.space.scripts(np.random.default_rng(0).random((40, len(GENES))))
+    made = [played(place, scripts, plainly) for plainly in (False, True)]
+    damage = [place.harm(one)[0] for one in made]
+    assert not made[0].ended.any() and damage[0].any() and not damage[0].all() and (damage[0] == damage[1]).all()
+    hurt = int(np.argmax(damage[0].reshape(40, EPISODES).sum(axis=1)))
+    text = place.space.text(np.random.default_rng(0).random((40, len(GENES)))[hurt])
+    wanted, _ = as_evaluated(place, text)
+    assert wanted.ended.tolist() == damage[0].reshape(40, EPISODES)[hurt].tolist()
+
+
 def test_a_search_finds_what_no_listed_attack_does():
     """A late echo that waits for a slow car: the board's attacks damage 3 % of the episodes, the search over 35 %."""
     suite = load_suite("radar-v0")

@@ -12,7 +12,7 @@ import pytest
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 import tailgate
-from tailgate.agents.learners.selfplay import constant, export
+from tailgate.agents.learners.selfplay import constant, export, play
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Kind, Mode
 from tailgate.core.draws import keys
@@ -88,6 +88,21 @@ def test_the_challenge_knob_sets_how_often_the_probe_is_muted(short):
         trace = played(place, f"steered_cra:setting={number}", "none", range(100))
         muted, n = np.count_nonzero(~trace.probe), trace.probe.size
         assert abs(muted / n - chance) < 3.29 * np.sqrt(chance * (1 - chance) / n)
+
+
+def test_what_a_game_would_ignore_is_refused():
+    with pytest.raises(InputError, match=r"menu\.interval"):
+        Duel.make(**GUSTY, menu={"interval": 5})
+    with pytest.raises(InputError, match=r"menu: .* expected none"):
+        Duel.make(**GUSTY | {"defence": Steered(defence="chi2_kf")}, menu={"thresholds": [6, 9]})
+
+
+def test_the_cost_of_care_is_that_of_safety_whatever_the_payoff():
+    costs = {}
+    for payoff in ("safety", "zero_sum"):
+        duel = Duel.make(**GUSTY, payoff=payoff)
+        costs[payoff] = play(duel, tailgate.make_attack("none"), keys("train", range(8)), lambda seen: np.full(len(seen), 2)).cost
+    assert (costs["safety"] == costs["zero_sum"]).all() and (costs["safety"] > 0.0).all()
 
 
 @pytest.mark.long

@@ -200,12 +200,12 @@ def test_the_worst_attack_is_chosen_on_select_seeds(tiny):
     "select, report, worst, weak",
     [  # collisions in 8 episodes of: none, the script, self-play's last attacker, fresh against trained, fresh against fixed
         ([0, 3, 2, 5, 6], [0, 3, 2, 4, 4], ("fresh-fixed-0", "fresh-fixed-0"), False), ([0, 6, 2, 5, 5], [0, 3, 2, 4, 4], ("dos_jam", "dos_jam"), False),
-        ([0, 3, 2, 6, 5], [0, 3, 6, 4, 4], ("fresh-0", "fresh-0"), True), ([0, 0, 0, 0, 0], [0, 0, 0, 0, 0], ("none", "none"), False),
+        ([0, 3, 2, 6, 5], [0, 3, 6, 4, 4], ("fresh-0", "fresh-0"), False), ([0, 0, 0, 0, 0], [0, 0, 0, 0, 0], ("none", "none"), False),
         ([0, 8, 0, 0, 0], [0, 8, 0, 0, 0], ("dos_jam", "dos_jam"), True), ([0, 1, 6, 0, 0], [0, 1, 6, 0, 0], ("attacker-1", "attacker-1"), True),
     ],
 )  # fmt: skip
 def test_a_weak_search_is_said_to_be_one(select, report, worst, weak, brief, tmp_path, monkeypatch, capsys):
-    """Exploitability is that under the worst known attack, chosen on one purpose's seeds and reported on the other's; weak is a search that found less."""
+    """Exploitability is that under the worst known attack, chosen on one purpose's seeds and reported on the other's; weak is a search that surely found less."""
     monkeypatch.chdir(tmp_path)
     game = Game(load_config(None, [*TINY, "episodes=8", f"scenario={brief['scenario']}"]), lambda *_: None)
     other = {"select": select, "report": report}

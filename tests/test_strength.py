@@ -291,6 +291,21 @@ def test_a_dose_response_of_nothing_says_so(capsys: pytest.CaptureFixture[str], 
     assert "nothing was played; --threat" in capsys.readouterr().out
 
 
+def test_a_dose_response_of_means_has_no_critical_dose(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """Without a limit: the table has the means, and the report is written."""
+    words = ["dose-response", "fdi:start_step=20,value=5", "--defence", "kf", "--scenario", PLACE, "--doses", "5,10", "--episodes", "4"]
+    assert cli.main([*words, "--threat", "fdi_bound=10", "--outcome", "max_error", "--out", str(tmp_path)]) == 0
+    assert "max_error by dose" in capsys.readouterr().out and (tmp_path / "dose-response.json").is_file()
+
+
+@pytest.mark.parametrize("outcome", ["min_gap", "distance_travelled"])
+@pytest.mark.parametrize("command", ["timing", "transfer", "dose-response", "train"])
+def test_an_outcome_is_the_worse_the_larger(command: str, outcome: str, capsys: pytest.CaptureFixture[str]) -> None:
+    rest = {"dose-response": ["fdi", "--defence", "kf", "--scenario", PLACE, "--doses", "5"], "train": []}.get(command, [ZOO])
+    assert cli.main([command, *rest, *([f"outcome={outcome}"] if command == "train" else ["--outcome", outcome])]) == 2
+    assert "a metric where more is worse" in capsys.readouterr().err
+
+
 # -- pictures and commands
 
 

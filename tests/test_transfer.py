@@ -58,6 +58,13 @@ def test_a_difference_of_unequal_numbers_of_runs() -> None:
     assert single.low == single.high == pytest.approx(0.5)  # one policy each, and no difference among episodes
 
 
+def test_few_episodes_have_students_interval() -> None:
+    """Without an effect a difference of ten episodes seldom seems one: the bootstrap's interval alone leaves 0 out twice as often as it says."""
+    rng, none = np.random.default_rng(0), np.zeros((1, 10))
+    found = [difference(rng.standard_normal((1, 10)), none).low > 0.0 for _ in range(400)]
+    assert 0.005 <= np.mean(found) <= 0.04  # 2.5 %
+
+
 def test_a_mean_over_seeds_stays_a_share() -> None:
     """All ones: the interval ends at 1 and does not have zero width."""
     found = mean(np.ones((3, 40)), "crashed")

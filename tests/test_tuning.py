@@ -226,6 +226,14 @@ def test_the_command_prints_what_it_found(tmp_path: Path, capsys: pytest.Capture
     assert cli.main([*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == json.loads((tmp_path / "said-tune" / "trials.json").read_text())
     assert cli.main([*words, "--trials", "0"]) == 2
+    assert cli.main([*words, "--seed", "-1"]) == 2
+
+
+def test_any_seed_of_a_search_will_do(tmp_path: Path) -> None:
+    """Those above what numpy takes too."""
+    search = dataclasses.replace(_search(tmp_path, 1), seed=10**9)
+    search.directory.mkdir(parents=True)
+    assert tuning._open(search, 0).study_name
 
 
 def test_what_a_killed_search_left_of_its_journal_stops_nobody(tmp_path: Path, straight: tuple[tuning.Search, dict[str, Any]]) -> None:

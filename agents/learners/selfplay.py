@@ -24,7 +24,7 @@ class Played(NamedTuple):
 
     paid: Array  # discounted, to the defender
     crashed: Array  # bool
-    cost: Array  # cost of care: minus the defender's reward, undiscounted and without the collision
+    cost: Array  # cost of care: mean costs of `safety`, whatever the payoff, undiscounted
     decisions: int  # decisions of all games together
 
 
@@ -39,10 +39,11 @@ def play(duel: Duel, attack: Attack, keys: Keys, choose: Callable[[Array], Array
             break
         decisions += int(np.count_nonzero(~over))
         action = None if choose is None else choose(duel.defender_sees(state))
+        before = state.loop
         state, outcome, gained, _ = duel.step(state, attacker, action, over)
         hit = (outcome.collided | outcome.rear_collided) & ~over
         paid += weight * gained
-        cost -= gained + hit
+        cost += np.where(over, 0.0, duel.care(before, state.loop))
         crashed += hit
         weight *= gamma
     return Played(paid, crashed > 0.0, cost, decisions)

@@ -75,6 +75,8 @@ def steered(defence: str | Defence, menu: Menu) -> Steered:
         Spec("defence", defence).refuse_imports("duel")
         defence = Spec("defence", defence).make()
     if isinstance(defence, Steered):
+        if menu != Menu(interval=menu.interval):
+            raise InputError("menu", as_data(menu), "none: a steered defence has its own")
         if defence.policy is not None or defence.setting is not None:
             raise InputError("defence", as_data(defence), "a defence whose knobs are free: without a policy and a setting")
         return dataclasses.replace(defence, menu=dataclasses.replace(defence.menu, interval=menu.interval))
@@ -110,6 +112,8 @@ class Duel:
             raise unknown("defender_action", defender_action, ("menu", "box"))
         if menu is not None and not isinstance(menu, (dict, Menu)):
             raise InputError("menu", menu, "a mapping of knobs to settings")
+        if isinstance(menu, dict) and "interval" in menu:
+            raise InputError("menu.interval", menu["interval"], "the argument interval: both decide at the same time")
         menu = menu if isinstance(menu, Menu) else build(Menu, dict(menu or {}), "menu")
         interval = build(ActionSpec, {k: v for k, v in arguments.items() if k == "interval"}, "action").interval
         payoff = build(Payoff, {k: arguments.pop(k) for k in list(arguments) if k in fields_of(Payoff)}, "payoff")
@@ -186,6 +190,11 @@ class Duel:
         """Return the defender's reward (B,) of a decision."""
         if self.payoff.payoff == "zero_sum":
             return np.asarray(0.0 - outcome.reward)
+        crashed = (outcome.collided | outcome.rear_collided).astype(np.float64)
+        return np.where(over, 0.0, -crashed - self.care(before, after))
+
+    def care(self, before: LoopState, after: LoopState) -> Array:
+        """Return the costs (B,) of being careful in a decision, as `safety` counts them."""
         pay, dt, model = self.payoff, self.seat.loop.model.dt, self.seat.loop.model
         then, now = before.defence.memory, after.defence.memory
         quiet = after.channel.used == before.channel.used
@@ -195,8 +204,7 @@ class Duel:
             wanted = self.seat.loop.controller.desired_gap(scene.speed[:, cars])
             wide = np.max(np.clip(scene.gap[:, cars] / np.maximum(wanted, 1.0) - 1.0, 0.0, 1.0), axis=1)
             cost = cost + pay.gap_cost * wide * (after.k - before.k)
-        crashed = (outcome.collided | outcome.rear_collided).astype(np.float64)
-        return np.where(over, 0.0, -crashed - dt * cost)
+        return np.asarray(dt * cost)
 
     # -- spaces
 

@@ -66,7 +66,7 @@ def _print(report: dict[str, Any]) -> None:
     share = report["unit"] == "0/1"
     what = report["outcome"] if report["exceeds"] is None else f"{report['outcome']} > {report['exceeds']:g}"
     limited, doses = report["limit"] is not None, report["doses"]
-    columns = ["defence", "attack", *map(str, doses), *[f"critical dose (above {shown(report['limit'], share)})"] * limited]
+    columns = ["defence", "attack", *map(str, doses), *([f"critical dose (above {shown(report['limit'], share)})"] if limited else [])]
     rows = []
     for curve in report["curves"]:
         figures = ["-"] * len(doses) if "skipped" in curve else [shown(point["value"], share) for point in curve["points"]]

@@ -43,8 +43,8 @@ class Memory(NamedTuple):
 class Played(NamedTuple):
     """The outcome of episodes (B,) so far."""
 
-    ended: Array  # a collision
-    gap: Array  # smallest gap of a car behind another [m]; inf where nobody drives
+    ended: Array  # a collision that ends the episode
+    gap: Array  # smallest gap of a car behind another [m]; inf where nobody drives, -inf after a collision that does not end the episode
     error: Array  # largest error of an estimate
     moved: Array  # distance of the car that comes least far [m]; inf where nobody drives
 
@@ -167,6 +167,8 @@ def step(loop: Loop, attack: Decider, plan: object, held: Any) -> tuple[Any, Any
     over = held["loop"].ended
     state, memory, frame = loop.step(held["loop"], cast("Attack", attack), plan, held["memory"])
     gap = np.min(np.where(loop.model.followers, frame.scene.gap, np.inf), axis=1)
+    if not loop.ends_on_collision:
+        gap = np.where(frame.collided | frame.rear_collided, -np.inf, gap)
     error = np.max(loop.model.error(frame.estimate.x, frame.truth), axis=1)
     moved = np.min(np.where(loop.model.followers, frame.scene.position - held["first"], np.inf), axis=1)
     gap = np.where(over, held["gap"], np.minimum(held["gap"], gap))

@@ -17,13 +17,12 @@ import numpy as np
 
 from tailgate.base.errors import InputError
 from tailgate.core import Array, Kind, draws
-from tailgate.core.draws import Keys
+from tailgate.core.draws import Keys, Role
 from tailgate.core.schema import as_data, digest
+from tailgate.ensemble.battery import played_plainly
 from tailgate.ensemble.schedule import Schedule, Scheduled, schedule_of
 from tailgate.ensemble.search import FINAL, FIRST, MORE, Arena, Found, Meaningless
 from tailgate.ensemble.space import GENES
-from tailgate.play.metrics import METRICS
-from tailgate.play.trace import rollout
 
 if TYPE_CHECKING:
     from tailgate.engine.torch_form import torch
@@ -246,7 +245,7 @@ def starts(arena: Arena, pace: Pace, seed: int, scripts: Sequence[str] = ()) -> 
     given = [schedule_of(text, brief) for text in scripts[: pace.starts]]
     if len(given) == pace.starts:
         return given
-    rng = np.random.default_rng([seed, zlib.crc32(f"gradient/{arena.scenario}/{arena.dose}/{arena.defence}".encode())])
+    rng = np.random.default_rng([seed, zlib.crc32(f"gradient/{arena.name}/{arena.dose}/{arena.defence}".encode())])
     genomes = rng.random((pace.scripts, len(GENES)))
     genomes[:, 0] = (np.array(families)[np.arange(pace.scripts) % len(families)] + 0.5) / len(space.families)
     many = space.scripts(genomes)
@@ -270,9 +269,12 @@ def hindsight(arena: Arena, start: Schedule, episodes: int, rounds: int, purpose
     injection, bound = Injection(arena.loop, start.when()), None if arena.loop.model.followers.any() else arena.bound
     own = Schedule(start.trigger, *(np.repeat(part[None], episodes, axis=0) for part in (start.values, start.chosen)))
     hit = np.zeros(episodes, bool)
+    reach = arena.reach(purpose, first, episodes)
     for schedule in (own, ascend(injection, own, arena.loop.threat.budget, rounds, keys, bound)):
-        trace = rollout(arena.loop, Scheduled(schedule), keys, plain=True)
-        hit |= (METRICS["crashed"](trace) > 0) | (METRICS["max_error"](trace) > (np.inf if bound is None else bound))
+        attack = Scheduled(schedule)
+        plan = attack.prepare(arena.loop.brief)
+        memory = attack.start(plan, episodes, keys.at(Role.ATTACK, np.zeros(episodes, np.int64)))
+        hit |= arena.harm(played_plainly(arena.loop, attack, plan, keys, memory), reach)[0]
     return float(np.mean(hit))
 
 

@@ -167,7 +167,7 @@ class Arena:
         """
         if self.loop.model.followers.any():
             stalled, slowed = self._stalled(played, reach)
-            return played.ended | stalled, np.maximum(np.clip(1.0 - played.gap / self.start, 0.0, 1.0), slowed)
+            return played.ended | np.isneginf(played.gap) | stalled, np.maximum(np.clip(1.0 - played.gap / self.start, 0.0, 1.0), slowed)
         if self.bound is None:
             raise InputError("suite: bound", None, f"an error that counts as damage: nobody drives in {self.scenario}")
         return played.ended | (played.error > self.bound), np.clip(played.error / self.bound, 0.0, 1.0)
@@ -344,7 +344,7 @@ def search(
     leads, families, genes = list(space.leads), len(space.families), space.genes
     if not families:
         return np.zeros((0, genes))
-    rng = np.random.default_rng([seed, zlib.crc32(f"{arena.scenario}/{arena.dose}/{arena.defence}".encode()), genes])
+    rng = np.random.default_rng([seed, zlib.crc32(f"{arena.name}/{arena.dose}/{arena.defence}".encode()), genes])
     count, more, most = effort.sizes(arena.loop.model.agents)
     pool, episode = Pool(np.zeros((0, genes)), np.zeros(0), np.zeros(0)), 0
     for generation in range(effort.generations):

@@ -11,6 +11,7 @@ import json
 import tempfile
 import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -58,6 +59,8 @@ class Job(NamedTuple):
         one = self.arena
         played = load_scenario(one.scenario).config_hash  # another content under the same name is searched again
         code = [sources.own(), Spec("defence", one.defence).digest, played]
+        if find_spec("torch") is None:  # some members have no meaning without it: later they have
+            code.append("without torch")
         return f"{one.name}-{'own' if one.dose is None else one.dose}-{digest([NAME, *code, *map(str, self)])}"
 
 
@@ -73,8 +76,10 @@ def jobs_of(
     """
     if budget not in BUDGETS:
         raise unknown("--budget", budget, BUDGETS)
-    if seed < 0:
-        raise InputError("--seed", seed, "a whole number, not below 0")
+    if not 0 <= seed < 2**32:
+        raise InputError("--seed", seed, "a whole number from 0 to 4294967295")
+    if "knowledge" in suite.granted:
+        raise InputError(f"suite {suite.name}: threat.knowledge", suite.granted["knowledge"], "none: each member knows what its class says")
     for name in scenarios:
         if name not in suite.scenarios:
             raise unknown("--scenario", name, suite.scenarios)
@@ -83,7 +88,7 @@ def jobs_of(
             raise InputError("--dose", dose, f"one of the suite's: {', '.join(map(str, suite.doses))}")
     arenas = [
         Arena(suite.name, scenario, dose, defence, dict(suite.granted), suite.bound, suite.progress)
-        for scenario in scenarios or suite.scenarios for dose in doses or suite.doses
+        for scenario in dict.fromkeys(scenarios or suite.scenarios) for dose in dict.fromkeys(doses or suite.doses)
     ]  # fmt: skip
     played, why = [], ""
     for arena in arenas:

@@ -28,12 +28,21 @@ DETECTION_DEADLINE = 10  # [steps]
 Function = Callable[[Trace], Array]
 METRICS: dict[str, Function] = {}
 UNITS: dict[str, str] = {}  # on a road
+LESS_IS_WORSE = ("min_gap", "min_ttc", "distance_travelled")
 ERRORS = ("rmse_position", "max_error", "final_error")  # norms over states of mixed units if there is no road
 
 
 def unit_in(name: str, model: Model) -> str:
     """Return the unit of a metric in episodes of this model; "-" if it has none, or several."""
     return "-" if name in ERRORS and not model.followers.any() else UNITS[name]
+
+
+def check_outcome(field: str, name: str) -> None:
+    """Raise InputError unless a metric can be the outcome of an attack: there more is worse."""
+    if name not in METRICS:
+        raise unknown(field, name, METRICS)
+    if name in LESS_IS_WORSE:
+        raise InputError(field, name, "a metric where more is worse, for example crashed, max_error or impact_speed")
 
 
 def metric(unit: str) -> Callable[[Function], Function]:

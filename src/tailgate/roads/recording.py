@@ -166,7 +166,7 @@ def _uniform(raw: Raw, part: Array, dt: float, repairs: dict[str, int]) -> Segme
     """Return the samples of a segment on a grid of about dt [s]; where samples are lost, the own speed is interpolated."""
     t = raw.t[part]
     count = round(float((t[-1] - t[0]) / dt)) + 1
-    grid, dt = np.linspace(t[0], t[-1], count, retstep=True)  # so that a rounded dt does not add up
+    grid, dt = np.asarray(np.linspace(t[0], t[-1], count)), float((t[-1] - t[0]) / (count - 1))  # a rounded dt would add up
     columns: list[Array] = [raw.gap[part], raw.relative_speed[part], raw.speed[part]]
     places = np.rint((t - t[0]) / dt).astype(np.int64)
     if np.abs(t - t[0] - dt * places).max() > 1e-6 + 0.02 * dt:

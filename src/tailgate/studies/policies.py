@@ -21,7 +21,7 @@ from tailgate.core.schema import canonical, fields_of
 from tailgate.core.threat import ThreatModel
 from tailgate.evaluation.cells import Cell
 from tailgate.evaluation.stats import Interval, paired_difference, proportion
-from tailgate.play.metrics import METRICS, UNITS
+from tailgate.play.metrics import UNITS, check_outcome
 from tailgate.training.comparison import SHARE
 from tailgate.training.train import TrainConfig, outcome_of, plan_key
 
@@ -174,8 +174,8 @@ def _required(value: str | None, option: str, who: Trained) -> str:
 
 def outcome_for(outcome: str | None, scenario: str) -> str:
     """Return the metric that is counted: the one asked for, else crashed, or rmse_position where there is no road."""
-    if outcome is not None and outcome not in METRICS:
-        raise unknown("outcome", outcome, METRICS)
+    if outcome is not None:
+        check_outcome("outcome", outcome)
     return outcome_of(TrainConfig(scenario=scenario, outcome=outcome))
 
 

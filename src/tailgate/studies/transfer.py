@@ -31,20 +31,23 @@ T = TypeVar("T")
 ALL = "all"  # the word for every registered defence
 
 
-def difference(a: Array, b: Array, share: bool = False) -> Interval:
+def difference(a: Array, b: Array, share: bool = False, level: float = LEVEL) -> Interval:
     """Return mean of a (runs, episodes) less that of b (other runs, the same episodes), with an interval.
 
     Episodes are paired, training seeds are not: their part is Welch's t over the runs' means, and missing where each side has one.
     """
     from scipy import special
 
-    paired = paired_difference(a.mean(axis=0), b.mean(axis=0), LEVEL, share=share)
+    paired = paired_difference(a.mean(axis=0), b.mean(axis=0), level, share=share)
     parts = [(float(x.mean(axis=1).var(ddof=1)) / len(x), len(x) - 1) for x in (a, b) if len(x) > 1]
     variance, spread = sum(v for v, _ in parts), 0.0
     if variance > 0.0:
         freedom = variance**2 / sum(v**2 / n for v, n in parts)
-        spread = float(special.stdtrit(freedom, (1 + LEVEL) / 2)) * variance**0.5
+        spread = float(special.stdtrit(freedom, (1 + level) / 2)) * variance**0.5
     low, high = paired.value - paired.low, paired.high - paired.value
+    if not share:  # a bootstrap of few episodes is too narrow
+        wider = float(special.stdtrit(max(1, a.shape[1] - 1), (1 + level) / 2) / special.ndtri((1 + level) / 2))
+        low, high = wider * low, wider * high
     return around(paired.value, np.hypot(low, spread), np.hypot(high, spread), share)
 
 
@@ -92,13 +95,15 @@ def transfer(
         bad = next((row for row in mine if row["status"] != "ok" or row[counted] is None), None)
         if bad is None:
             held[cell.attack, cell.defence] = np.array([row[counted] for row in mine], np.float64)
-        elif cell.attack == "none":
+        elif cell.attack == "none" or ("none", cell.defence) in held:
             reason = bad["reason"] or f"{counted} is undefined in some episodes"
-            skipped.append({"defence": cell.defence, "reason": reason})
+            whose = ({"policy": one.name, "trained_on": origins[one.text]} for one in good if one.text == cell.attack)
+            skipped.append({"defence": cell.defence} | next(whose, {}) | {"reason": reason})
     if ALL in defences:
         columns = tuple(column for column in columns if ("none", column) in held)
     origin_rows = dict.fromkeys(origins[who.text] for who in good)
     entries: list[dict[str, Any]] = []
+    comparisons: list[tuple[dict[str, Any], Array, Array]] = []
     for column in columns:
         played = {
             origin: np.array([held[who.text, column] for who in good if origins[who.text] == origin and (who.text, column) in held])
@@ -116,9 +121,12 @@ def transfer(
             }  # fmt: skip
             own = played.get(column)
             if own is not None and len(own) and origin != column:
-                gain = difference(values, own, is_share(counted))
-                entry |= {"over_own": gain._asdict(), "flags": ["transferred beats own"] if gain.low > 0.0 else []}
+                entry |= {"over_own": difference(values, own, is_share(counted))._asdict(), "flags": []}
+                comparisons.append((entry, values, own))
             entries.append(entry)
+    for entry, values, own in comparisons:  # all of a report at once: Bonferroni
+        if difference(values, own, is_share(counted), 1.0 - (1.0 - LEVEL) / len(comparisons)).low > 0.0:
+            entry["flags"] = ["transferred beats own"]
     loaded = load_scenario(where).with_threat(**(changed | ({} if dose is None else {"budget": dose})))
     return {
         "measure": "transfer", "scenario": where, "purpose": purpose, "episodes": episodes, "outcome": counted,

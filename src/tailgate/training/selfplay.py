@@ -279,12 +279,13 @@ class Game:
         for defender, own in {TRAINED: [path.stem for path in fresh], FIXED: [path.stem for path in other]}.items():
             shares = self._select(defender, defenders[defender], attacks)
             name, found = (max(names, key=lambda one: shares[one].value) for names in (attacks, own))  # of equal ones the first
-            share = {one: _share(crashed[defender, one]) for one in (name, found, last)}
+            share = {one: _share(crashed[defender, one]) for one in (name, found)}
+            most = max(attacks, key=lambda one: np.count_nonzero(crashed[defender, one]))
             worst[defender] = {"attack": name, "select": shares[name]._asdict(), "collisions": share[name]._asdict()}
             exploitability[defender] = {
                 **paired_difference(crashed[defender, name], crashed[defender, last], share=True)._asdict(), "attack": name,
                 "fresh": {"attack": found, "collisions": share[found]._asdict()},
-                "weak_search": share[found].value < max(share[name].value, share[last].value),
+                "weak_search": paired_difference(crashed[defender, most], crashed[defender, found], share=True).low > 0.0,
             }  # fmt: skip
         fixed, trained = (crashed[defender, worst[defender]["attack"]] for defender in (FIXED, TRAINED))
         saved = paired_difference(fixed, trained, share=True)

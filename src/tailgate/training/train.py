@@ -31,7 +31,7 @@ from tailgate.envs.gym.attacker_mdp import Seat
 from tailgate.envs.gym.rewards import Reward
 from tailgate.evaluation.baselines import best_of
 from tailgate.evaluation.cells import cells_of
-from tailgate.play.metrics import METRICS
+from tailgate.play.metrics import check_outcome
 from tailgate.training.settings import check_folder, check_mappings, check_places, mapping, parameters_of, started_with
 from tailgate.training.trainings import Training, train_all
 
@@ -129,8 +129,8 @@ def checked(data: dict[str, Any]) -> TrainConfig:
     check_folder(config.out, config.name)
     if config.device is not None:
         cards.checked(config.device)
-    if config.outcome is not None and config.outcome not in METRICS:
-        raise unknown("config.outcome", config.outcome, METRICS)
+    if config.outcome is not None:
+        check_outcome("config.outcome", config.outcome)
     shown = () if config.teacher in (None, "best") else (config.teacher,)
     for defence in (config.defence, *config.others):
         Spec("defence", defence).refuse_imports("config")

@@ -154,6 +154,8 @@ def make_search(
     sizes.check("episodes", episodes)
     config = load_config(source, overrides + ([f"learner={learner}"] if learner else []))
     base = dataclasses.replace(config, name=f"{config.name}-tune")
+    if seed < 0:
+        raise InputError("--seed", seed, "a whole number, not below 0")
     return Search(base, read_space(space, base.learner), trials, episodes, seed)
 
 
@@ -224,7 +226,7 @@ def _open(search: Search, ordinal: int | None = None) -> Study:
     module = optuna()
     path = search.directory / JOURNAL
     backend = module.storages.journal.JournalFileBackend(str(path), _JournalLock(path))  # JSON lines, never pickles
-    sampler = module.samplers.TPESampler(seed=search.seed * SAMPLER_STRIDE + (ordinal or 0), multivariate=False)
+    sampler = module.samplers.TPESampler(seed=(search.seed * SAMPLER_STRIDE + (ordinal or 0)) % 2**32, multivariate=False)
     with _journal_of(search):
         storage = module.storages.JournalStorage(backend)
         study: Study = module.create_study(
