@@ -85,7 +85,7 @@ class Trace:
         assert model.gap is not None
         estimate = self.estimate[:n, row]
         if model.lane or model.agents > 1 or model.air:
-            gap = np.stack([x @ rows for x, rows in zip(np.moveaxis(estimate, 1, 0), model.gap, strict=True)], axis=1)
+            gap = np.add.accumulate(estimate * model.gap, axis=2)[..., -1]
             return np.asarray(model.lane - np.abs(gap) if model.lane else gap)
         if "leader_position" in model.v2v:
             leader = self.wires[:n, row, :, model.wires.index("leader_position")]
