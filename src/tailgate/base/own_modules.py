@@ -5,8 +5,11 @@ In front, or from the start, any file there could take the place of a package th
 
 from __future__ import annotations
 
+import functools
 import os
 import sys
+import types
+from pathlib import Path
 
 _wanted = False
 
@@ -25,3 +28,28 @@ def folders() -> list[str]:
 def join() -> None:
     """Put the place of the user's modules on the path: one of them is about to be imported."""
     sys.path += [folder for folder in folders() if folder not in sys.path]
+
+
+@functools.cache
+def editable(module: str) -> bool:
+    """Return True for a module that is neither this package's nor installed: a script, a notebook, a file of somebody's."""
+    top, file = module.partition(".")[0], getattr(sys.modules.get(module), "__file__", None)
+    if top in ("tailgate", "builtins") or (top in sys.stdlib_module_names and module != "__main__"):
+        return False
+    return file is None or not {"site-packages", "dist-packages"} & set(Path(file).parts)
+
+
+def files_of(value: object) -> list[Path]:
+    """Return the files that somebody's class or function comes from, its own first: those of its bases and of what its module imports."""
+    bases = getattr(value, "__mro__", (value,))
+    left, seen, found = [str(base.__module__) for base in bases], set[str](), dict[str, Path]()
+    for name in left:  # which grows
+        module = sys.modules.get(name)
+        if module is None or name in seen or not (editable(name) or name == left[0]):
+            continue
+        seen.add(name)
+        if (file := getattr(module, "__file__", None)) and Path(file).is_file():
+            found[name] = Path(file)
+        for part in vars(module).values() if editable(name) else ():
+            left.append(part.__name__ if isinstance(part, types.ModuleType) else str(getattr(part, "__module__", "")))
+    return [*list(found.values())[:1], *sorted(list(found.values())[1:])]

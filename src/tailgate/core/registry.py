@@ -16,6 +16,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Literal, TypedDict, TypeVar, Unpack
 
+from tailgate.base import own_modules
 from tailgate.base.errors import InputError, unknown
 from tailgate.base.lazy import components, loaded
 from tailgate.core.foreign import class_of, unregistered, with_place
@@ -323,7 +324,7 @@ class Spec:
 
             return digest_of(self.sandboxed[1])
         head, params = self._parts()
-        paths = [Path(inspect.getfile(imported(family, name).cls)) for family, name in self._imported()]
+        paths = [path for family, name in self._imported() for path in own_modules.files_of(imported(family, name).cls)]
         paths += [Path(inspect.getfile(find(family, name).cls)) for family, name in self._plugged() if family in PARTS]
         if self.family == "attack":
             paths = [Path(str(text)) for text in (head, params.get("path")) if Path(str(text)).suffix in _FILES] or paths

@@ -7,6 +7,7 @@ Types follow numpy's rules: a Python number takes the type of the array that it 
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable, Iterator, Sequence
 from types import SimpleNamespace
@@ -16,9 +17,10 @@ import numpy as np
 
 from tailgate.engine.buffers import blended, boxed, common_shape, swept, wide
 from tailgate.engine.graph import Graph, Node
-from tailgate.engine.operations import BOOL, Array, ArrayLike, Axis, DTypeLike
+from tailgate.engine.operations import BOOL, Array, ArrayLike, Axis, DTypeLike, with_operators
 from tailgate.engine.untraceable import Untraceable
 
+WIDEST = {"b": np.int64, "i": np.int64, "u": np.uint64}  # of sums of whole numbers
 _ZERO = np.zeros((), np.int8)
 if TYPE_CHECKING:
     _Base = np.ndarray[Any, np.dtype[Any]]
@@ -26,6 +28,7 @@ else:
     _Base = object
 
 
+@with_operators
 class Traced(_Base):
     """An array of nodes; `batch`: the index of the episodes' axis, or None; `weak`: the type of a Python number, or None."""
 
@@ -165,7 +168,9 @@ class Traced(_Base):
         to = np.dtype(dtype)
         if self.dtype.kind == "f" and not self.fixed and (to.kind == "u" or (to.kind == "i" and to.itemsize < 8)):
             raise Untraceable(f"a float as {to}", "write x.astype(np.int64): numpy's answer to other types depends on the machine")
-        return self.copy() if to == self.dtype else self.mapped(lambda node: self.graph.cast(node, to), to)
+        if to == self.dtype:
+            return self.copy() if copy else self
+        return self.mapped(lambda node: self.graph.cast(node, to), to)
 
     def mapped(self, function: Callable[[Node], Node], dtype: DTypeLike | None = None) -> Traced:
         """Apply a function to each node."""
@@ -175,13 +180,7 @@ class Traced(_Base):
 
     def _key(self, key: object) -> tuple[Any, ...]:
         """Return an index of numpy's without traced arrays."""
-        parts = key if isinstance(key, tuple) else (key,)
-        masks = "write np.where(mask, x, y) for all rows"
-        return tuple(
-            part.known("rows of a mask" if part.dtype == BOOL else "an index", masks if part.dtype == BOOL else "write num.take(x, index)")
-            if isinstance(part, Traced) else part
-            for part in parts
-        )  # fmt: skip
+        return tuple(_index(part) if isinstance(part, Traced) else part for part in (key if isinstance(key, tuple) else (key,)))
 
     def __getitem__(self, key: object) -> Traced:
         plain = self._key(key)
@@ -199,7 +198,7 @@ class Traced(_Base):
             self.batch = self.batch if self.batch is not None else mask.batch
             return
         plain, new = self._key(key), lifted(graph, value, self.dtype)
-        cast = typed(graph, new, self.dtype).nodes
+        cast = new.astype(self.dtype, copy=False).nodes
         self.nodes[plain] = cast if cast.ndim else cast[()]
         if new.batch is not None and self.batch is None and self.shape[:1] == (1,):
             self.batch = 0
@@ -243,37 +242,21 @@ class Traced(_Base):
     def __pow__(self, exponent: float) -> Array:
         """Raise to 0.5, 1 or 2; for other exponents numpy calls a library whose bits differ between machines."""
         known = float(exponent)
+        if self.weak and not isinstance(exponent, np.ndarray):  # Python's own power, which is another function
+            return lifted(self.graph, self.values().item() ** (exponent.values().item() if isinstance(exponent, Traced) else exponent))
         if known not in (0.5, 1.0, 2.0):
             raise Untraceable(f"the power {known}", "write products, or num.exp(p * num.log(x))")
-        return {0.5: np.sqrt, 1.0: np.positive, 2.0: np.square}[known](self)
+        kind = type(exponent) if type(exponent) in (int, float) else np.result_type(getattr(exponent, "weak", None) or exponent)
+        base = self.astype(np.power.resolve_dtypes((self.dtype, kind, None))[0], copy=False)
+        return {0.5: np.sqrt, 1.0: np.positive, 2.0: np.square}[known](base)
 
 
-def _operators() -> None:
-    """Define Python's operators by numpy's functions, also reflected and in place."""
-    pairs = {
-        "add": np.add, "sub": np.subtract, "mul": np.multiply, "truediv": np.true_divide, "floordiv": np.floor_divide, "mod": np.remainder,
-        "and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor, "lshift": np.left_shift, "rshift": np.right_shift,
-        "matmul": np.matmul,
-    }  # fmt: skip
-
-    def plain(ufunc: np.ufunc) -> Callable[[Any, Any], Any]:
-        return lambda self, other: ufunc(self, other)
-
-    def reflected(ufunc: np.ufunc) -> Callable[[Any, Any], Any]:
-        return lambda self, other: ufunc(other, self)
-
-    def in_place(ufunc: np.ufunc) -> Callable[[Any, Any], Any]:
-        return lambda self, other: ufunc(self, other, out=(self,))
-
-    for name, ufunc in pairs.items():
-        setattr(Traced, f"__{name}__", plain(ufunc))
-        setattr(Traced, f"__r{name}__", reflected(ufunc))
-        setattr(Traced, f"__i{name}__", in_place(ufunc))
-    comparisons = {"lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal, "eq": np.equal, "ne": np.not_equal}
-    for name, ufunc in comparisons.items():
-        setattr(Traced, f"__{name}__", plain(ufunc))
-    for name, single in {"neg": np.negative, "abs": np.absolute, "invert": np.invert, "pos": np.positive}.items():
-        setattr(Traced, f"__{name}__", (lambda ufunc: lambda self: ufunc(self))(single))
+def _index(part: Traced) -> Any:
+    """Return a part of an index without traced arrays; a number shows a view, as in numpy, and an array a copy."""
+    if part.dtype == BOOL:
+        return part.known("rows of a mask", "write np.where(mask, x, y) for all rows")
+    found = part.known("an index", "write num.take(x, index)")
+    return found if found.ndim else operator.index(found[()])
 
 
 def each(graph: Graph, function: Callable[..., Node], *arrays: Array) -> Array:
@@ -328,7 +311,11 @@ def _of_all(graph: Graph, nodes: Array, arrays: Sequence[Traced], dtype: np.dtyp
 
 def typed(graph: Graph, x: Traced, dtype: np.dtype[Any]) -> Traced:
     """Convert x to a type."""
-    return x if x.dtype == dtype else x.mapped(lambda node: graph.cast(node, dtype), dtype)
+    if x.dtype == dtype:
+        return x
+    out = x.mapped(lambda node: graph.cast(node, dtype), dtype)
+    out.weak = x.weak and (float if dtype.kind == "f" else x.weak)
+    return out
 
 
 def result_type(arrays: Sequence[Traced]) -> np.dtype[Any]:
@@ -363,10 +350,12 @@ def axes_of(x: Traced, axis: Axis, instead: str) -> list[int]:
 
 def summands(x: Traced, axis: Axis, dtype: DTypeLike | None = None) -> Traced:
     """Return x in the type of its sum; raise Untraceable if it is too long to sum in a fixed order."""
-    long = max((x.shape[a] for a in axes_of(x, axis, "name the axis")), default=0)
-    if x.dtype.kind == "f" and long > 7:
-        raise Untraceable(f"a sum of {long} numbers", "write num.dot, or a loop: numpy's order of them depends on their place in memory")
-    return typed(x.graph, x, np.dtype(dtype or (np.int64 if x.dtype.kind in "bi" else x.dtype)))
+    axes = axes_of(x, axis, "name the axis")
+    long = math.prod(x.shape[a] for a in axes)
+    if x.dtype.kind == "f" and (long > 7 or sum(x.shape[a] > 1 for a in axes) > 1):
+        what = f"a sum of {long} numbers" if long > 7 else "a sum over several axes"
+        raise Untraceable(what, "write num.dot, or a loop: numpy's order of them depends on their place in memory")
+    return typed(x.graph, x, np.dtype(dtype or WIDEST.get(x.dtype.kind, x.dtype)))
 
 
 def reduced(x: Traced, op: str, axis: Axis, keepdims: bool, instead: str = "name an axis that is not the episodes'") -> Traced:
@@ -392,5 +381,3 @@ def reduced(x: Traced, op: str, axis: Axis, keepdims: bool, instead: str = "name
         out = out.mapped(lambda node: x.graph.binary("add", node, zero))  # numpy begins with 0.0: no sum is -0.0
     return out[()] if out.ndim else out
 
-
-_operators()

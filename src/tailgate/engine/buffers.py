@@ -86,7 +86,7 @@ def swept(graph: Graph, function: Callable[..., Any], lead: Sequence[int], array
     made = result if isinstance(result, np.ndarray) else boxed(result)
     shape, sources = _fewer([lead[i] for i in kept], sources)
     buffer = graph.sweep(shape, carried, sources, list(made.flat))
-    return graph.picks(buffer).reshape(*lead, *made.shape)
+    return graph.picks(buffer).copy().reshape(*lead, *made.shape)  # code may write to it
 
 
 def boxed(node: object) -> Array:
@@ -201,7 +201,7 @@ def _copied(graph: Graph, nodes: Array) -> Node:
 
 def blended(graph: Graph, where: Node, x: Array, y: Array) -> Array:
     """Return the array x where `where` is true, else y."""
-    return graph.picks(graph.blend(where, buffer_of(graph, x), buffer_of(graph, y))).reshape(x.shape)
+    return graph.picks(graph.blend(where, buffer_of(graph, x), buffer_of(graph, y))).copy().reshape(x.shape)
 
 
 def sides(graph: Graph, nodes: Array) -> tuple[Node, Array, Array] | None:

@@ -15,7 +15,7 @@ import numpy as np
 from tailgate.engine.array import Traced, chosen, each, lifted, result_type, shared_batch, typed
 from tailgate.engine.buffers import boxed, swept, wide
 from tailgate.engine.graph import Graph, Node
-from tailgate.engine.operations import FLOAT, Array, ArrayLike, Axis, DTypeLike, Shape
+from tailgate.engine.operations import Array, ArrayLike, Axis, DTypeLike, Shape
 from tailgate.engine.untraceable import Untraceable
 
 
@@ -109,7 +109,7 @@ def _least(x: Traced, axis: int, op: str) -> Traced:
 
 def _wins(graph: Graph, op: str, p: Node, b: Node) -> Node:
     better = graph.binary(op, p, b)
-    if p.dtype != FLOAT:
+    if p.dtype.kind != "f":
         return better
     return graph.binary("or", better, graph.binary("and", graph.binary("ne", p, p), graph.binary("eq", b, b)))
 
@@ -260,14 +260,21 @@ def _makers(graph: Graph) -> dict[str, Callable[..., Any]]:
     def as_array(x: object, dtype: DTypeLike | None = None, order: str | None = None, copy: bool | None = None) -> Any:
         if isinstance(x, (list, tuple)) and any(isinstance(part, Traced) for part in _inside(x)):
             x = _stack([as_array(part) for part in x])
-        return x if not isinstance(x, Traced) or dtype is None else x.astype(dtype)
+        return x if not isinstance(x, Traced) or dtype is None else x.astype(dtype, copy=False)
+
+    def contiguous(x: object, dtype: DTypeLike | None = None) -> Any:
+        held = as_array(x, dtype)
+        if isinstance(held, Traced):  # numpy copies where the numbers do not lie so, which traced code does not know
+            held = held.copy()
+            held.flags.writeable = False
+        return held
 
     def array(x: object, dtype: DTypeLike | None = None, order: str | None = None, copy: bool = True, ndmin: int = 0) -> Any:
         held = as_array(x, dtype)
         return held.copy() if isinstance(held, Traced) and copy else held
 
     return {
-        "zeros": filled(0), "ones": filled(1), "empty": filled(0), "full": full, "asarray": as_array, "ascontiguousarray": as_array,
+        "zeros": filled(0), "ones": filled(1), "empty": filled(0), "full": full, "asarray": as_array, "ascontiguousarray": contiguous,
         "asanyarray": as_array, "array": array,
     }  # fmt: skip
 

@@ -56,17 +56,18 @@ def present(values: Array, candidates: Iterable[int]) -> list[int]:
 
 
 def pick(ring: Array, place: Array) -> Array:
-    """Return ring[..., place] of a ring (B, ..., L) and whole numbers that broadcast to (B, ...)."""
+    """Return ring[..., place] of a ring (B, ..., L) and whole numbers from -L to L - 1 that broadcast to (B, ...)."""
     if not isinstance(ring, Traced):
         if ring.ndim == 2 and np.ndim(place) == 1:
             return ring[np.arange(len(ring)), place]
         return np.take_along_axis(ring, np.broadcast_to(place, ring.shape[:-1])[..., None], axis=-1)[..., 0]
-    return picked(ring, place)
+    return picked(ring, _counted(place, ring.shape[-1]))
 
 
 def put(ring: Array, place: Array, value: Array) -> Array:
-    """Return the ring (B, ..., L) with `value` (B, ...) at `place`, which broadcasts to (B, ...)."""
+    """Return the ring (B, ..., L) with `value` (B, ...) at `place`, from -L to L - 1, which broadcasts to (B, ...)."""
     if isinstance(ring, Traced):
+        place = _counted(place, ring.shape[-1])
         return np.where(place[..., None] == np.arange(ring.shape[-1]), value[..., None], ring)
     out = ring.copy(order="K")
     if ring.ndim == 2 and np.ndim(place) == 1:
@@ -104,14 +105,21 @@ def broken(rows: Array, field: str, found: str, wanted: str, k: Array) -> InputE
     return error
 
 
+def _counted(place: Array, size: int) -> Array:
+    """Return places counted from the first one, where negative ones count from behind the last, as numpy does."""
+    if not isinstance(place, Traced) or place.dtype.kind in "ub":
+        return place
+    return np.where(place < 0, place + size, place)
+
+
 LISTED = 8  # entries of a table that traced code compares one by one
 
 
 def take(table: Array, index: Array) -> Array:
-    """Return table[index] of a table (K, ...) and whole numbers from 0 to K - 1."""
+    """Return table[index] of a table (K, ...) and whole numbers from -K to K - 1."""
     if not isinstance(index, Traced):
         return table[index]
-    if len(table) > LISTED and not index.fixed:
+    if isinstance(index := _counted(index, len(table)), Traced) and len(table) > LISTED and not index.fixed:
         return gathered(table, index)
     wide = index[(..., *(None,) * (table.ndim - 1))]
     out: Array = np.broadcast_to(table[0], (*index.shape, *table.shape[1:]))

@@ -134,7 +134,7 @@ def inverse(s: Array) -> Array:
         return Traced(s.graph, np.stack([part.nodes for part in parts]).reshape(s.shape), FLOAT, s.batch)
     if isinstance(s, Traced) and (s.fixed or _large(s.size, s)):
         held = table_of(s.graph, s.nodes) if s.fixed else buffer_of(s.graph, s.nodes)
-        return Traced(s.graph, s.graph.picks(s.graph.inverses(held, q)).reshape(s.shape), FLOAT, s.batch)
+        return Traced(s.graph, s.graph.picks(s.graph.inverses(held, q)).copy().reshape(s.shape), FLOAT, s.batch)
     out = s.copy()
     for p in range(q):
         scale = 1.0 / out[..., p, p]

@@ -7,20 +7,22 @@ Objects that differ only in such numbers have the same `key`.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import enum
 import functools
 import hashlib
-import sys
 import types
+import weakref
 from collections import defaultdict
-from collections.abc import Sequence
-from pathlib import Path, PurePath
+from collections.abc import Iterator, Sequence
+from pathlib import PurePath
 from typing import Any, TypeVar, cast
 
 import numpy as np
 
+from tailgate.base.own_modules import editable, files_of
 from tailgate.base.sources import own
 from tailgate.engine.array import Traced
 from tailgate.engine.buffers import boxed
@@ -29,6 +31,7 @@ from tailgate.engine.operations import FLOAT, Array
 
 T = TypeVar("T")
 LARGE = 20_000  # numbers of an array that is used as it is, because code usually reads few of them
+_caches: weakref.WeakSet[Any] = weakref.WeakSet()  # of somebody's functions that traced code calls
 _PLAIN = (type(None), str, bytes, int, complex, enum.Enum, np.generic, np.dtype, type, types.BuiltinFunctionType, np.ufunc, PurePath)
 
 
@@ -45,19 +48,43 @@ class Parameters:
         reader = _Reader(None)
         reader.visit(held)
         self.values = reader.values
-        self._modules = reader.modules
+        self._classes = reader.classes
         self.kept = reader.kept  # objects known by their id must live as long as the key
+        self.attributes = reader.attributes
+        self.whole = (*reader.key, *(leaf.tobytes() for leaf in reader.values))
         self.key = None if reader.changeable else tuple(reader.key)
 
     @property
     def sources(self) -> str:
         """A hash of the files that define the classes and functions, of Tailgate and of others."""
-        digest = hashlib.sha256(own().encode())
-        for name in sorted(self._modules):
-            file = getattr(sys.modules.get(name), "__file__", None)
-            if name.partition(".")[0] != "tailgate" and file and Path(file).is_file():
-                digest.update(Path(file).read_bytes())
+        digest = hashlib.sha256(f"{own()}/{np.__version__}".encode())
+        for file in sorted({file for one in self._classes if not str(one.__module__).startswith("tailgate.") for file in files_of(one)}):
+            digest.update(file.read_bytes())
         return digest.hexdigest()
+
+    def changed(self, held: object) -> str:
+        """Return which of these objects has changed since, by its class and attribute, or that a global has; empty if none."""
+        now = Parameters(held)
+        if now.whole == self.whole:
+            return ""
+        for one, before, after in zip(self.kept, self.attributes, now.attributes, strict=False):
+            for name in after:
+                if before.get(name) != after[name]:
+                    return f"{type(one).__name__}.{name}"
+        return "a global"
+
+    @contextlib.contextmanager
+    def restored(self) -> Iterator[None]:
+        """Give objects their attributes of before back after a trace, and empty caches of functions: nodes may have come into them."""
+        before = [(one, dict(vars(one))) for one in self.kept if hasattr(one, "__dict__") and not isinstance(one, types.FunctionType)]
+        try:
+            yield
+        finally:
+            for one, attributes in before:
+                vars(one).clear()
+                vars(one).update(attributes)
+            for cache in list(_caches):
+                cache.cache_clear()
 
 
 class Reading:
@@ -127,7 +154,8 @@ class _Reader:
         self.key: list[Any] = []
         self.values: list[Array] = [] if graph is None else graph.parameters
         self.kept: list[Any] = []
-        self.modules: set[str] = set()
+        self.classes: dict[Any, None] = {}
+        self.attributes: list[dict[str, Any]] = []  # of `kept`
         self.changeable = False
         self._known: dict[int, tuple[int, Any, Any]] = {}
 
@@ -145,7 +173,7 @@ class _Reader:
             return out
         number = len(self._known)
         self.key += [type(held), _code_of(type(held))]
-        self.modules.update(base.__module__ for base in type(held).__mro__)
+        self.classes[type(held)] = None
         self._known[id(held)] = number, held, held
         out = self._copied(held, number)
         self._known[id(held)] = number, held, out  # the original stays alive, so that its id is not reused
@@ -174,7 +202,8 @@ class _Reader:
             return self._function(held)
         if not dataclasses.is_dataclass(held):
             self.kept.append(held)
-            self.key.append(id(held))
+            self.attributes.append({name: _value(part, set()) for name, part in getattr(held, "__dict__", {}).items()})
+            self.key += [id(held), *self.attributes[-1].items()]
             self.changeable = self.changeable or not isinstance(held, frozenset)
             return held
         self.changeable = self.changeable or not _frozen(type(held))
@@ -199,8 +228,9 @@ class _Reader:
 
     def _function(self, held: types.FunctionType) -> Any:
         self.kept.append(held)
+        self.attributes.append({})
         self.key += [held.__code__, id(held.__globals__), read_by(held)]
-        self.modules.add(str(held.__module__))
+        self.classes[held] = None
         defaults, named = self.visit(held.__defaults__), self.visit(held.__kwdefaults__)
         parts = [self.visit(cell.cell_contents) for cell in held.__closure__ or ()]
         if self.graph is None or not (parts or defaults or named):
@@ -238,21 +268,12 @@ def _named(held: object) -> Any:
 def _code_of(kind: type) -> tuple[Any, ...]:
     """Return the functions of a class and its bases, which may be replaced at run time; of somebody else's class all that these read."""
     functions = tuple(part for base in kind.__mro__ for part in vars(base).values() if isinstance(part, types.FunctionType))
-    return functions + tuple(_values_of(base, set()) for base in kind.__mro__ if _editable(base.__module__))
+    return functions + tuple(_values_of(base, set()) for base in kind.__mro__ if editable(base.__module__))
 
 
 def read_by(function: types.FunctionType) -> tuple[Any, ...]:
     """Return the globals and defaults that somebody else's function reads, and so on: they may change while the process runs."""
-    return _read(function, set()) if _editable(str(function.__module__)) else ()
-
-
-@functools.cache
-def _editable(module: str) -> bool:
-    """Return True for a module that is neither Tailgate's nor installed: a script, a notebook, a file of somebody's."""
-    top, file = module.partition(".")[0], getattr(sys.modules.get(module), "__file__", None)
-    if top in ("tailgate", "builtins") or (top in sys.stdlib_module_names and module != "__main__"):
-        return False
-    return file is None or not {"site-packages", "dist-packages"} & set(Path(file).parts)
+    return _read(function, set()) if editable(str(function.__module__)) else ()
 
 
 def _read(function: types.FunctionType, seen: set[int]) -> tuple[Any, ...]:
@@ -264,8 +285,19 @@ def _read(function: types.FunctionType, seen: set[int]) -> tuple[Any, ...]:
         names += code.co_names
         codes += [part for part in code.co_consts if isinstance(part, types.CodeType)]
     held = [(name, function.__globals__[name]) for name in dict.fromkeys(names) if name in function.__globals__]
-    given = [*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values()]
+    for name, module in list(held):  # what is read of somebody's module by its name
+        if isinstance(module, types.ModuleType) and editable(module.__name__):
+            held += [(f"{name}.{part}", vars(module)[part]) for part in dict.fromkeys(names) if part in vars(module)]
+    cells = [cell for cell in function.__closure__ or () if _filled(cell)]
+    given = [*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values(), *(cell.cell_contents for cell in cells)]
     return function.__code__, *((name, _value(value, seen)) for name, value in held), *(_value(value, seen) for value in given)
+
+
+def _filled(cell: types.CellType) -> bool:
+    try:
+        return cell.cell_contents is not cell
+    except ValueError:
+        return False
 
 
 def _values_of(kind: type, seen: set[int]) -> tuple[Any, ...]:
@@ -284,10 +316,15 @@ def _value(held: object, seen: set[int]) -> Any:
         return tuple(_value(part, seen) for part in (held.fget, held.fset) if part is not None)
     if isinstance(held, functools.cached_property):
         held = held.func
+    if isinstance(held, functools._lru_cache_wrapper):
+        _caches.add(held)
+        held = held.__wrapped__
+    if isinstance(held, functools.partial):
+        held = [held.func, held.args, held.keywords]
     if isinstance(held, types.FunctionType):
-        return _read(held, seen) if _editable(str(held.__module__)) else held.__code__
+        return _read(held, seen) if editable(str(held.__module__)) else held.__code__
     if isinstance(held, type):
-        return _values_of(held, seen) if _editable(held.__module__) else _Same(held)
+        return _values_of(held, seen) if editable(held.__module__) else _Same(held)
     if isinstance(held, (tuple, list, dict)):
         if id(held) in seen:  # it may hold itself
             return "again"
@@ -296,6 +333,13 @@ def _value(held: object, seen: set[int]) -> Any:
         return type(held), *((repr(key), _value(part, seen)) for key, part in parts)
     if isinstance(held, np.ndarray) and held.dtype != object:
         return held.shape, held.dtype.str, held.tobytes()
+    if isinstance(held, (set, frozenset)):
+        return type(held), *sorted(map(repr, held))
+    if isinstance(held, types.SimpleNamespace) or (editable(type(held).__module__) and hasattr(held, "__dict__")):
+        if id(held) in seen:
+            return "again"
+        seen.add(id(held))
+        return type(held), *((name, _value(part, seen)) for name, part in vars(held).items())
     if isinstance(held, _PLAIN) or type(held) is float:
         return type(held), repr(held) if isinstance(held, (float, complex)) else _named(held)
     return _Same(held)

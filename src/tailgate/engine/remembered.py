@@ -74,13 +74,20 @@ class Remembered(Generic[T]):
             key = None if parameters.key is None else (form, parameters.key)
             if found := self._find(key, parameters):
                 return adopt(found, parameters.values)
-            made = make()
+            with parameters.restored():
+                made = make()
         except Exception as error:  # a plug-in may raise anything when arrays are not numpy's
             return Untraced(explained(error))
         names = [f"{program.function.name}.{parameters.sources}" for program in made.programs]
-        if not objects.proved(names):
+        if key is None or not objects.proved(names):
             if differs := difference(made):
                 return Untraced(f"traced code and the plain loop differ in {differs}")
+            if parameters.changed(held):  # once, as a cache that is filled, or in every step?
+                begin()
+                before = Parameters(held)
+                difference(made)
+                if wrote := before.changed(held):
+                    return Untraced(f"a step writes to {wrote}: keep what changes in the state that start returns")
             objects.prove(names)
         self._keep(key, parameters, [program.trace.graph for program in made.programs], made)
         return made

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.engine.array import Traced, each, elementwise, lifted, reduced, summands, typed
+from tailgate.engine.array import WIDEST, Traced, each, elementwise, lifted, reduced, summands, typed
 from tailgate.engine.graph import Graph, Node
 from tailgate.engine.operations import BOOL, COMPARISONS, Array, ArrayLike, DTypeLike
 from tailgate.engine.untraceable import Untraceable
@@ -52,6 +52,8 @@ def called(graph: Graph, ufunc: np.ufunc, method: str, inputs: Sequence[ArrayLik
     else:
         raise Untraceable(f"np.{ufunc.__name__}.{method} with {', '.join(options) or 'this'}", "write a loop over the axis")
     if out:
+        if not np.can_cast(result.dtype, out[0].dtype, "same_kind"):
+            raise TypeError(f"cannot cast the result of {ufunc.__name__} from {result.dtype} to {out[0].dtype}")
         out[0][...] = result
         return out[0]
     return result
@@ -66,6 +68,8 @@ def _elementwise(graph: Graph, ufunc: np.ufunc, arrays: list[Traced], dtype: DTy
     kinds = [BOOL] * len(arrays) if ufunc in _LOGICAL else loop_types(ufunc, arrays)
     if dtype is not None:
         kinds = [np.dtype(dtype)] * len(arrays)
+    elif len(arrays) > 1 and ufunc not in _LOGICAL and kinds[0].kind in "iu" and kinds[0] != np.int64:
+        kinds = [_exact(ufunc, op, arrays, kinds[0])] * len(arrays)
     if any(kind.kind not in "fiub" for kind in kinds):
         raise Untraceable(f"np.{ufunc.__name__} of {', '.join(map(str, kinds))}", "use real numbers")
     arrays = [typed(graph, a, kind) for a, kind in zip(arrays, kinds, strict=True)]
@@ -76,6 +80,17 @@ def _elementwise(graph: Graph, ufunc: np.ufunc, arrays: list[Traced], dtype: DTy
     if len(arrays) == 1:
         return elementwise(graph, lambda x: graph.unary(op, x), arrays, kinds[0])
     return elementwise(graph, lambda x, y: graph.binary(op, x, y), arrays, BOOL if op in COMPARISONS else kinds[0])
+
+
+def _exact(ufunc: np.ufunc, op: str, arrays: Sequence[Traced], kind: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the type in which narrow whole numbers meet Python's: numpy compares them as they are, and computes with no others."""
+    limits = np.iinfo(kind)
+    wrong = [a for a in arrays if a.weak is int and not limits.min <= a.values().item() <= limits.max]
+    if not wrong:
+        return kind
+    if op not in COMPARISONS or kind == np.uint64:
+        raise OverflowError(f"Python integer {wrong[0].values().item()} out of bounds for {kind}, in np.{ufunc.__name__}")
+    return np.dtype(np.int64)
 
 
 def loop_types(ufunc: np.ufunc, arrays: Sequence[Traced]) -> list[np.dtype[Any]]:
@@ -140,8 +155,8 @@ def _accumulated(ufunc: np.ufunc, x: Traced, axis: int = 0) -> Traced:
     op = _PAIRS.get(ufunc)
     if op not in ("add", "mul", "min", "max", "and", "or"):
         raise Untraceable(f"np.{ufunc.__name__}.accumulate", "write a loop over the axis")
-    if op in ("add", "mul") and x.dtype.kind in "bi":
-        x = typed(x.graph, x, np.dtype(np.int64))
+    if op in ("add", "mul"):
+        x = typed(x.graph, x, np.dtype(WIDEST.get(x.dtype.kind, x.dtype)))
     if x.batch == axis % x.ndim:
         raise Untraceable("an accumulation over the episodes", "name another axis")
     nodes = np.empty(x.shape, object)
@@ -152,20 +167,27 @@ def _accumulated(ufunc: np.ufunc, x: Traced, axis: int = 0) -> Traced:
 
 
 def _sign(x: Array) -> Array:
-    return np.where(x > 0, 1.0, np.where(x < 0, -1.0, np.where(x == 0, 0.0, x)))
+    found = np.where(x > 0, 1, np.where(x < 0, -1, 0)).astype(x.dtype)
+    return np.where((x == 0) | (found != 0), found, x) if x.dtype.kind == "f" else found
+
+
+def _reciprocal(x: Traced) -> Array:
+    if x.dtype.kind != "f":
+        raise Untraceable("np.reciprocal of whole numbers", "write 1 // x, or 1.0 / x")
+    return 1.0 / x
 
 
 def _copied_sign(x: Traced, y: Traced) -> Array:
-    graph, word = x.graph, np.dtype(np.uint64)
+    graph, word, kind = x.graph, np.dtype(np.uint64), loop_types(np.copysign, [x, y])[0]
     x, y = typed(graph, x, np.dtype(float)), typed(graph, y, np.dtype(float))
     sign = np.uint64(1 << 63)
-    return ((x.view(word) & ~sign) | (y.view(word) & sign)).view(float)
+    return ((x.view(word) & ~sign) | (y.view(word) & sign)).view(float).astype(kind)
 
 
 _DERIVED: dict[np.ufunc, Callable[..., Array]] = {
     np.square: lambda x: x * x,
     np.positive: lambda x: x.copy(),
-    np.reciprocal: lambda x: 1.0 / x,
+    np.reciprocal: lambda x: _reciprocal(x),
     np.isfinite: lambda x: np.absolute(x) < np.inf,
     np.isnan: lambda x: x != x,
     np.isinf: lambda x: np.absolute(x) == np.inf,

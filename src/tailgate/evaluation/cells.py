@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.base import sizes, sources
+from tailgate.base import own_modules, sizes, sources
 from tailgate.base.errors import InputError, NotApplicable, known_arguments
 from tailgate.base.files import write_atomic
 from tailgate.base.pool import apart, each
@@ -205,8 +205,8 @@ def _code(value: type | Function) -> str:
     """Return the hash of the file that defines somebody's class or function, or of the source in a notebook; empty for this package's."""
     if value.__module__.partition(".")[0] == "tailgate":
         return ""
-    with contextlib.suppress(OSError, TypeError):
-        return hashlib.sha256(Path(inspect.getfile(value)).read_bytes()).hexdigest()
+    if files := own_modules.files_of(value):
+        return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
     with contextlib.suppress(OSError, TypeError):
         return hashlib.sha256(inspect.getsource(value).encode()).hexdigest()
     return ""
