@@ -5,10 +5,10 @@ In front, or from the start, any file there could take the place of a package th
 
 from __future__ import annotations
 
+import ast
 import functools
 import os
 import sys
-import types
 from pathlib import Path
 
 _wanted = False
@@ -39,6 +39,23 @@ def editable(module: str) -> bool:
     return file is None or not {"site-packages", "dist-packages"} & set(Path(file).parts)
 
 
+def _imported(file: Path, package: str) -> list[str]:
+    """Return the names of modules that a file may import, and of what may be modules in them."""
+    try:
+        tree = ast.parse(file.read_bytes())
+    except (SyntaxError, ValueError):
+        return []
+    out: list[str] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            out += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            above = package.split(".")
+            base = ".".join([*(above[: len(above) + 1 - node.level] if node.level else []), *([node.module] if node.module else [])])
+            out += [base, *(f"{base}.{alias.name}" for alias in node.names)]
+    return out
+
+
 def files_of(value: object) -> list[Path]:
     """Return the files that somebody's class or function comes from, its own first: those of its bases and of what its module imports."""
     bases = getattr(value, "__mro__", (value,))
@@ -50,6 +67,5 @@ def files_of(value: object) -> list[Path]:
         seen.add(name)
         if (file := getattr(module, "__file__", None)) and Path(file).is_file():
             found[name] = Path(file)
-        for part in vars(module).values() if editable(name) else ():
-            left.append(part.__name__ if isinstance(part, types.ModuleType) else str(getattr(part, "__module__", "")))
+            left += _imported(found[name], str(module.__package__ or "")) if editable(name) else []
     return [*list(found.values())[:1], *sorted(list(found.values())[1:])]

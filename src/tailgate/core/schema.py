@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from pydantic.errors import PydanticSchemaGenerationError, PydanticUserError
 
@@ -126,6 +127,10 @@ def as_data(value: object) -> Any:
         return [as_data(v) for v in value]
     if isinstance(value, (types.NoneType, bool, int, float, str)):
         return value
+    if isinstance(value, np.generic):
+        return as_data(value.item())
+    if isinstance(value, np.ndarray):
+        return {"array": [value.dtype.str, list(value.shape), hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()]}
     if isinstance(value, Path):  # what the file says counts, not where it lies
         return f"{value.name}#{hashlib.sha256(value.read_bytes()).hexdigest()[:16]}" if value.is_file() else value.name
     named = value if callable(value) and hasattr(value, "__qualname__") else type(value)  # a repr may hold an address

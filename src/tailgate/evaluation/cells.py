@@ -20,17 +20,19 @@ import numpy as np
 
 from tailgate.base import own_modules, sizes, sources
 from tailgate.base.errors import InputError, NotApplicable, known_arguments
-from tailgate.base.files import write_atomic
+from tailgate.base.files import set_aside, write_atomic
+from tailgate.base.locks import alone
 from tailgate.base.pool import apart, each
 from tailgate.base.reading import YAML_ENDS
 from tailgate.base.version import VERSION
 from tailgate.core import Attack, Defence, Model, draws
 from tailgate.core.foreign import with_place
 from tailgate.core.registry import Entry, Family, Spec, entry_for, text_of
-from tailgate.core.scenario import Scenario, ScenarioLike, Suite, list_scenarios, load_scenario, load_suite
+from tailgate.core.scenario import Scenario, ScenarioLike, Suite, load_scenario, load_suite
 from tailgate.core.schema import as_data, canonical
 from tailgate.core.threat import Brief
 from tailgate.engine.cards import DeviceError, device, playing_on
+from tailgate.evaluation.arguments import distinct, named_scenarios, several
 from tailgate.evaluation.devices import check_cells
 from tailgate.evaluation.frame import Rows
 from tailgate.evaluation.resume import complete
@@ -287,33 +289,6 @@ def _play(cells: Sequence[Cell], workers: int) -> Generator[tuple[int, list[dict
     )
 
 
-def _several(value: object) -> list[Any]:
-    """Return a list of the value, which may be a single name, number, mapping or object."""
-    return list(value) if isinstance(value, Iterable) and not isinstance(value, str | Mapping) else [value]
-
-
-def _named(scenarios: Sequence[ScenarioLike]) -> dict[str, Scenario | None]:
-    """Return scenarios by name, with the object where one is given; a file is its own name."""
-    out: dict[str, Scenario | None] = {}
-    for one in scenarios:
-        place = None if isinstance(one, str | Path) else load_scenario(one)
-        name = str(one) if place is None else place.name
-        before = out.get(name)
-        same = place is before if place is None or before is None else place.config_hash == before.config_hash
-        if (name in out and not same) or (place is not None and _taken(place)):
-            raise InputError("scenarios", name, "a different name for each object, and no built-in scenario's or file's")
-        out[name] = place
-    return out
-
-
-def _taken(place: Scenario) -> bool:
-    """If a name belongs to a file, or to a built-in scenario that differs in more than its threat model: rows would name another one."""
-    if place.name not in list_scenarios():
-        return place.name.endswith(YAML_ENDS)
-    known = load_scenario(place.name)
-    return dataclasses.replace(place, threat_model=known.threat_model).config_hash != known.config_hash
-
-
 @known_arguments
 def evaluate(
     suite: str | Suite | None = None,
@@ -360,18 +335,18 @@ def evaluate(
                 workers=workers, out=out, threat=threat, beacon=beacon, progress=progress, metrics=metrics,
             )  # fmt: skip
     base = load_suite(suite) if isinstance(suite, str) else suite if suite is not None else Suite(name="custom")
-    defences, attacks = _several(base.defences if defences is None else defences), _several(base.attacks if attacks is None else attacks)
+    defences, attacks = several(base.defences if defences is None else defences), several(base.attacks if attacks is None else attacks)
     if threat and base.granted | threat != base.granted and not beacon:  # no longer what the suite is about; a beacon's seeds need the name
         base = dataclasses.replace(base, name="custom")
     sizes.check("batch", batch)
     sizes.check("workers", workers)
     sizes.check("seeds", base.seeds if seeds is None else seeds)
-    places = _named(_several(base.scenarios if scenarios is None else scenarios))
+    places = named_scenarios(several(base.scenarios if scenarios is None else scenarios))
     given = {name: place for name, place in places.items() if place is not None}
     named = dataclasses.replace(
         base,
         scenarios=tuple(places),
-        doses=tuple(_several(base.doses if doses is None else doses)),
+        doses=tuple(several(base.doses if doses is None else doses)),
         defences=tuple(d for d in defences if isinstance(d, str)),
         attacks=tuple(a for a in attacks if isinstance(a, str)),
         seeds=base.seeds if seeds is None else seeds,
@@ -382,7 +357,9 @@ def evaluate(
     for dose in named.doses:
         if dose is not None and (not isinstance(dose, int) or dose < 0):
             raise InputError("dose", dose, "a whole number of attack steps, not below 0")
-    own = tuple(_several(metrics))
+    distinct([(component("defence", one)[2], one) for one in defences], "defences")
+    distinct([(component("attack", one)[2], one) for one in attacks], "attacks")
+    own = tuple(several(metrics))
     cells = cells_of(named, batch=batch, purpose=purpose, threat=threat, beacon=beacon, metrics=own, given=given)
     rows = run(cells, Path(out) if out is not None else None, workers, progress) if cells else []
     for defence in defences:
@@ -395,5 +372,8 @@ def evaluate(
                     rest = named.seeds, purpose, 0, batch, named.granted | dict(threat or {}), beacon, own, given.get(scenario)
                     rows += run_cell(Cell(named.name, scenario, dose, guard, adversary, *rest), defence, attack)
     if out is not None and len(rows) > sum(cell.seeds for cell in cells):
-        write_atomic(Path(out), packed(rows, Path(out)))  # with the rows of objects
+        with alone(Path(out)):
+            if not cells and Path(out).exists():  # else `run` has set aside what was there
+                set_aside(Path(out))
+            write_atomic(Path(out), packed(rows, Path(out)))  # with the rows of objects
     return Rows(rows)

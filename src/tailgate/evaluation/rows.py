@@ -24,6 +24,8 @@ KEYS = (
     "suite", "scenario", "dose", "knowledge", "defence", "attack", "purpose", "config_hash", "version", "defence_digest", "attack_digest",
 )  # fmt: skip
 
+IF_ANY = ("beacon", "versions", "uses")  # columns that older rows may lack; they tell cells apart as well
+
 Row = dict[str, Any]  # one episode: KEYS, every metric, and all that is needed to play it again
 CLEAN = "none"  # the attack that does nothing, and the defence that does nothing
 AGAIN = "run the command that wrote it again to complete it"

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.evaluation.rows import KEYS
+from tailgate.evaluation.rows import IF_ANY, KEYS
 from tailgate.evaluation.stats import proportion
 
 ENTRY = ("n", "failed", "crash", "refused_all")  # keys of an entry that are no column of a row
@@ -15,7 +15,7 @@ FIGURES = ("min_gap", "max_error", "rmse_position", "alarm_onsets", "alarm_rate"
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return one entry per cell (the columns of rows.KEYS), in order of appearance; of repeated seeds the last row counts.
+    """Return one entry per cell (the columns of rows.KEYS, and of IF_ANY), in order of appearance; of repeated seeds the last row counts.
 
     crash: share of episodes with a collision in front or behind, with a 95 % Clopper-Pearson interval.
     Other columns are medians with quartiles, those of somebody's own metrics too.
@@ -23,12 +23,13 @@ def summarise(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """
     groups: dict[tuple[Any, ...], dict[int, dict[str, Any]]] = {}
     for row in rows:
-        groups.setdefault(tuple(row[key] for key in KEYS), {})[row["seed"]] = row
+        key = (*(row[key] for key in KEYS), *(repr(row.get(name)) for name in IF_ANY))
+        groups.setdefault(key, {})[row["seed"]] = row
     out = []
     for key, by_seed in groups.items():
         members = list(by_seed.values())
         good = [row for row in members if row["status"] == "ok"]
-        entry: dict[str, Any] = dict(zip(KEYS, key, strict=True))
+        entry: dict[str, Any] = dict(zip(KEYS, key, strict=False)) | {name: members[0].get(name) for name in IF_ANY}
         entry |= {
             "n": len(good), "failed": sum(r["status"] == "error" for r in members), "learned": bool(members[0].get("learned")),
             "optimal": bool(members[0].get("optimal")), "reason": next((r["reason"] for r in members if r["status"] != "ok"), ""),

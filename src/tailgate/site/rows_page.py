@@ -15,7 +15,7 @@ from tailgate.board.entry import reference
 from tailgate.board.schema import Data
 from tailgate.board.words import Name, names_of, percent, shade, spans, steps, ticks
 from tailgate.core.registry import Entry, entries
-from tailgate.evaluation.rows import KEYS
+from tailgate.evaluation.rows import IF_ANY, KEYS
 from tailgate.evaluation.summary import summarise
 from tailgate.play.metrics import METRICS
 
@@ -82,7 +82,7 @@ def _section(key: tuple[Any, ...], group: Sequence[Data], rows: Sequence[Data], 
     kept: dict[tuple[str, str, str], Data] = {}
     for e in group:
         before = kept.setdefault((e["defence"], e["attack"], e["knowledge"]), e)
-        if differs := [name for name in KEYS if e[name] != before[name]]:
+        if differs := [name for name in (*KEYS, *IF_ANY) if e[name] != before[name]]:
             where = f"rows of {e['scenario']}, {e['defence']}, {e['attack']}: {differs[0]}"
             raise InputError(where, [before[differs[0]], e[differs[0]]], "one: a cell of a page has one figure, so build a page of each")
     columns = list(dict.fromkeys((e["attack"], e["knowledge"]) for e in group))
