@@ -44,7 +44,8 @@ def phase_over(phase: Array, clock: Array, speed: Array, low: float, high: float
 
 def stop_and_go(phase: Array, speed: Array, low: float, high: float, decel: float, rate: float, dt: float) -> Array:
     """Return the acceleration in a phase of stop and go [m/s^2], elementwise; no more than the phase's last speed needs."""
-    slow, fast = np.maximum(-decel, (low - speed) / dt), np.minimum(rate, (high - speed) / dt)
+    slow = np.minimum(np.maximum(-decel, (low - speed) / dt), 0.0)
+    fast = np.maximum(np.minimum(rate, (high - speed) / dt), 0.0)
     out: Array = np.where(phase == BRAKE, slow, np.where(phase == SPEED_UP, fast, 0.0))
     return out
 

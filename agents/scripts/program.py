@@ -201,6 +201,10 @@ def _ready(phase: Phase, brief: Brief, where: str) -> Ready:
     if kind in AIRED:
         target = on_receivers(brief, where, target, bool(names))
         target = target & (np.cumsum(target, axis=1) == 1)  # one draw of `probability` for all that a receiver reads
+    if kind == Kind.INSIDER:
+        target = target & brief.geared
+        if not target.any():
+            raise NotApplicable(f"{where}.kind", phase.kind, "a car whose law weighs one of the targets")
     try:
         timing = phase.trigger.prepare(brief)
     except InputError as error:  # the file is sound, but not for steps of this length

@@ -126,7 +126,7 @@ class Channel:
         threat, kind, aimed = plan.threat, command.kind, command.target.any(axis=(1, 2))
         charged = (kind != NONE) & aimed
         if num.some(charged):
-            charged = charged & self._legal(plan, command) & self.allowed(plan, state, k)
+            charged = charged & self._legal(plan, state, command) & self.allowed(plan, state, k)
         refused = ((kind != NONE) | aimed) & ~charged
 
         hit = command.target & charged[:, None, None]
@@ -155,7 +155,7 @@ class Channel:
             state = state._replace(anchor=anchor, links=_copy_tape(state.links, begins), drives=_copy_tape(state.drives, begins))
         heard, under = sent, received
         if again is not None and num.some(num.take(_RADIATED, kind)):
-            under, left = again(self._radiated(plan, last)), (kind == DOS_JAM)[:, None, None]
+            under, left = again(self._radiated(plan, last)), (kind == DOS_JAM)[:, None, None] & hit[..., :q]
             under = under._replace(valid=np.where(left, received.valid, under.valid))  # what a jammer leaves is read where anything is
             heard = num.stack([under.y[..., i] for i in range(q)] + [sent[..., i] for i in range(q, sent.shape[-1])])
         links = self._arrive(plan, state, state.links, heard, slice(0, sent.shape[-1]))
@@ -185,7 +185,7 @@ class Channel:
         scaled = num.stack([np.where(inside[..., w], state.last.value[..., w], 1.0) for w in plan.gears])
         return scaled, inside.any(axis=2)
 
-    def _legal(self, plan: ChannelPlan, command: Command) -> Array:
+    def _legal(self, plan: ChannelPlan, state: ChannelState, command: Command) -> Array:
         """Return (B,) bool: the threat model grants kind, targets and values."""
         kind, value = command.kind, command.value
         known = (kind >= 0) & (kind < len(plan.kinds))
@@ -201,7 +201,11 @@ class Channel:
                     if effect.inside:  # an insider has the keys
                         fits = plan.geared & fits
                     elif plan.sealed.any() and not effect.over_air:  # a forged value is not accepted; an old one is until its key is known
-                        fits = fits & (~plan.sealed | (effect.recorded & (value <= plan.threat.key_interval)))
+                        age = value
+                        if one == REPLAY:  # its window, round after round
+                            played, window = state.played[:, None, None], np.maximum(value, 1.0)
+                            age = window * (1.0 + np.floor(played / window))
+                        fits = fits & (~plan.sealed | (effect.recorded & (age <= plan.threat.key_interval)))
                     ok = ok & ((kind != one)[:, None, None] | fits)
         return np.asarray(legal & ~(command.target & ~ok).any(axis=(1, 2)))
 

@@ -55,9 +55,12 @@ PERFECT = Link()
 START = np.uint32(0xFFFFFFFF)  # the step under which start() draws: no episode reaches it
 
 
-def check_estimate(estimate: Estimate, model: Model, batch: int, k: Array) -> None:
-    """Raise InputError when a defence's output at step k (B,) lacks the type, shape or finite values that the loop needs."""
-    shape = (batch, model.agents)
+def check_estimate(estimate: Estimate, model: Model, k: Array, ended: Array) -> None:
+    """Raise InputError when a defence's output at step k (B,) lacks the type, shape or finite values that the loop needs.
+
+    Numbers of episodes that have `ended` (B,) may be anything: they belong to no row.
+    """
+    shape = (len(k), model.agents)
     wanted = {
         "x": ((*shape, model.states), "f"), "score": (shape, "f"), "alarm": (shape, "b"), "mode": (shape, "iu"), "probe": (shape, "b"),
     }  # fmt: skip
@@ -67,20 +70,21 @@ def check_estimate(estimate: Estimate, model: Model, batch: int, k: Array) -> No
             got = f"{value.dtype} {value.shape}" if isinstance(value, (np.ndarray, Traced)) else type(value).__name__
             raise InputError(f"defence output {name}", got, f"an array of shape {size}, kind {kinds!r}")
         if kinds == "f":
-            num.demand(np.isfinite(value), f"defence output {name}", "NaN or infinity", "finite numbers", k)
+            num.demand(np.isfinite(value), f"defence output {name}", "NaN or infinity", "finite numbers", k, over=ended)
     if estimate.limits is not None:
         size = (*shape, len(model.actuators), 2)
         if estimate.limits.shape != size:
             raise InputError("defence output limits", estimate.limits.shape, f"an array of shape {size}, the lower limits first")
-        num.demand(estimate.limits[..., 0] <= estimate.limits[..., 1], "defence output limits", "limits", "the lower limits first", k)
+        fits = estimate.limits[..., 0] <= estimate.limits[..., 1]
+        num.demand(fits, "defence output limits", "limits", "the lower limits first", k, over=ended)
     if estimate.offset is not None:
         size = (*shape, len(model.actuators))
         if estimate.offset.shape != size:
             raise InputError("defence output offset", estimate.offset.shape, f"an array of shape {size}")
-        num.demand(np.isfinite(estimate.offset), "defence output offset", "NaN or infinity", "finite numbers", k)
+        num.demand(np.isfinite(estimate.offset), "defence output offset", "NaN or infinity", "finite numbers", k, over=ended)
     known = ", ".join(f"{m.value} ({m.name})" for m in Mode)
     fits = (estimate.mode >= 0) & (estimate.mode < len(Mode))
-    num.demand(fits, "defence output mode", "another number", f"one of {known}", k, estimate.mode)
+    num.demand(fits, "defence output mode", "another number", f"one of {known}", k, estimate.mode, ended)
 
 
 class LoopPlan(NamedTuple):
@@ -260,7 +264,7 @@ class Loop:
             plan.defence, state.defence, frozen(heard), frozen(state.known_u), state.keys.at(Role.DEFENCE, state.k)
         )
         defence, estimate = pair_of(answer)
-        check_estimate(estimate, self.model, len(state.k), state.k)
+        check_estimate(estimate, self.model, state.k, state.ended)
         if "probe" not in self.uses:  # only a defence that declares `probe` may mute it
             estimate = estimate._replace(probe=num.full(estimate.probe.shape, True, bool))
         assert received.v2v is not None

@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from tailgate import num
-from tailgate.core import Array, Count, Probability, Received, param
+from tailgate.core import Array, Probability, Received, param
 from tailgate.core.draws import Draws
+from tailgate.core.quantities import Latency
 
 
 class LinkState(NamedTuple):
@@ -28,7 +29,7 @@ class Link:
     """Loses each reading with a probability, independently, and delivers the others some steps late."""
 
     loss: Probability = param(0.0, "probability that a reading is lost [-]")
-    latency: Count = param(0, "steps by which readings and messages are late; the first one fills in for those that are not there yet")
+    latency: Latency = param(0, "steps by which readings and messages are late; the first one fills in for those that are not there yet")
 
     @property
     def perfect(self) -> bool:

@@ -9,7 +9,7 @@ import importlib
 import inspect
 import json
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
@@ -117,11 +117,16 @@ def register(family: Family, name: str, **card: Unpack[Card]) -> Callable[[T], T
     return add
 
 
+def check_uses(name: str, uses: Iterable[str]) -> None:
+    """Raise InputError for a use that the loop does not know."""
+    for use in uses:
+        if use not in USES:
+            raise unknown(f"{name}.uses", use, USES)
+
+
 def put(entry: Entry) -> None:
     """Add an entry; raise InputError for a taken name or an unknown use."""
-    for use in entry.uses:
-        if use not in USES:
-            raise unknown(f"{entry.name}.uses", use, USES)
+    check_uses(entry.name, entry.uses)
     held = _entries[entry.family].get(entry.name)
     if held is not None and held.cls is not entry.cls:
         raise InputError(f"{entry.family} name", entry.name, "a name that is not taken")
@@ -179,9 +184,14 @@ def fitting(family: Family, value: object) -> type:
 
 def entry_of(family: Family, name: str, cls: type) -> Entry:
     """Return an entry for somebody else's class, which may carry `uses`, `reference` and `version` as class attributes."""
-    uses = tuple(getattr(cls, "uses", ("measurements",)))
+    uses, version = getattr(cls, "uses", ("measurements",)), getattr(cls, "version", 1)
+    if isinstance(uses, str) or not isinstance(uses, tuple | list) or not all(isinstance(use, str) for use in uses):
+        raise InputError(f"{name}.uses", uses, "several names, such as ('measurements', 'v2v')")
+    check_uses(name, uses := tuple(uses))
+    if isinstance(version, bool) or not isinstance(version, int):
+        raise InputError(f"{name}.version", version, "a whole number")
     return Entry(
-        family, name, cls, version=int(getattr(cls, "version", 1)), reference=str(getattr(cls, "reference", "")), uses=uses,
+        family, name, cls, version=version, reference=str(getattr(cls, "reference", "")), uses=uses,
         knowledge=str(getattr(cls, "knowledge", "black")),
     )  # fmt: skip
 

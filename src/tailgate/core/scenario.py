@@ -108,6 +108,8 @@ def _check_truth(truth: dict[str, Any], where: str) -> None:
         if key not in ("plant", "sensor", "load", *LINK):
             raise unknown(f"{where}: unknown field", key, ("plant", "sensor", "load", *LINK))
     load = truth.get("load", 1.0)
+    if isinstance(plant := truth.get("plant"), dict) and "dt" in plant:
+        raise InputError(f"{where}.plant.dt", plant["dt"], "none: clock and manoeuvre have the scenario's")
     if isinstance(load, bool) or not isinstance(load, int | float) or not 0.1 <= load <= 10.0:
         raise InputError(f"{where}.load", load, "the mass over the nominal one, 0.1 to 10")
 

@@ -82,18 +82,23 @@ def ring_next(place: Array, size: int) -> Array:
     return np.where(place + 1 == size, 0, place + 1)
 
 
-def demand(condition: Array, field: str, found: str, wanted: str, k: Array, values: Array | None = None) -> None:
+def demand(
+    condition: Array, field: str, found: str, wanted: str, k: Array, values: Array | None = None, over: Array | None = None
+) -> None:  # fmt: skip
     """Raise InputError unless a condition (B, ...) holds in all rows, which are at steps k (B,). Traced code checks after its step.
 
-    The error says what is `found`; in plain code it shows `values`, if given.
+    The error says what is `found`; in plain code it shows `values`, if given. Rows that are `over` (B,) are not looked at.
     """
-    if isinstance(condition, Traced):
-        rows = condition.reshape(len(condition), -1).all(axis=1)
-        condition.graph.demands.append((field, found, wanted, rows.nodes[0]))
-    elif not condition.all() and values is not None:
+    if not isinstance(condition, Traced) and condition.all():
+        return
+    rows = condition.reshape(len(condition), -1).all(axis=1)
+    rows = rows if over is None else rows | over
+    if isinstance(rows, Traced):
+        rows.graph.demands.append((field, found, wanted, rows.nodes[0]))
+    elif not rows.all() and values is not None:
         raise InputError(field, np.unique(values).tolist(), wanted)
-    elif not condition.all():
-        raise broken(np.asarray(~condition.reshape(len(condition), -1).all(axis=1)), field, found, wanted, k)
+    elif not rows.all():
+        raise broken(np.asarray(~rows), field, found, wanted, k)
 
 
 def broken(rows: Array, field: str, found: str, wanted: str, k: Array) -> InputError:

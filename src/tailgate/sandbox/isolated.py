@@ -12,7 +12,6 @@ import numpy as np
 
 from tailgate.core import Array, Estimate, Model, Prior, Received
 from tailgate.core.draws import Draws
-from tailgate.core.loop import check_estimate
 from tailgate.core.veil import secret
 from tailgate.sandbox.limits import Limits
 from tailgate.sandbox.process import Process
@@ -83,16 +82,10 @@ class Isolated:
         plan.process.ask("start", {"mean": prior.mean, "cov": prior.cov}, ticket=plan.ticket)
         return _tickets(plan, batch)
 
-    def step(self, plan: IsolatedPlan, state: Tickets, received: Received, known_u: Array, draws: Draws) -> tuple[Tickets, Estimate]:
-        """Play one step of B episodes and check its outputs."""
-        state, estimate = self.step_unchecked(plan, state, received, known_u, draws)
-        check_estimate(estimate, plan.model, len(received.y), draws.step)
-        return state, estimate
-
-    def step_unchecked(
+    def step(
         self, plan: IsolatedPlan, state: Tickets, received: Received, known_u: Array, draws: Draws
     ) -> tuple[Tickets, Estimate]:
-        """Play one step with correct types and shapes but unchecked numbers, for callers that check each row, such as mixed batches.
+        """Play one step; types and shapes are correct, and the loop or the caller checks the numbers.
 
         The draws hold only the key of the party `defence`: a separate hash that reveals no other party's key.
         """

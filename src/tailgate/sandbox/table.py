@@ -133,7 +133,7 @@ def _serve(defence: Isolated, plan: IsolatedPlan, seats: list[Seat], secret: byt
         parts = [hand.draws for hand in hands if hand is not None]
         fields = {name: _merge([getattr(draws, name) for draws in parts], places) for name in ("key", "episode", "step")}
         try:
-            state, estimate = defence.step_unchecked(plan, state, received, known_u, Draws(**fields, stream=parts[0].stream))
+            state, estimate = defence.step(plan, state, received, known_u, Draws(**fields, stream=parts[0].stream))
         except Exception as error:
             _dismiss(seats, error)
             return
