@@ -51,6 +51,15 @@ def law_on(name, law, x, f, heard, i, dt, scales):
     return -scales[1] * law.b * (v - lead) - scales[0] * law.k * sum(off) / len(off), keep * f
 
 
+def test_a_phase_of_a_program_is_an_insider_too(tmp_path):
+    """It aims at what the law weighs, as the script does, and not at the actuator."""
+    (tmp_path / "inside.yaml").write_text(
+        f"phases:\n  - kind: insider\n    value: 0.0\n    trigger: {{name: time, start: {FIRST}}}\n    length: {LENGTH}\n"
+    )
+    trace = play(place_of(), f"program:path={tmp_path / 'inside.yaml'}")
+    assert not trace.refused.any() and ((trace.kind != 0).sum(axis=0) == LENGTH).all()
+
+
 @pytest.mark.thin(3)
 @pytest.mark.parametrize("name", LAWS)
 def test_an_insider_drives_by_the_printed_law_with_other_gains(name):

@@ -193,6 +193,15 @@ def test_an_old_value_is_accepted_until_its_key_is_known():
     assert same(played_in("delay:age=3", authenticated=FIELDS, key_interval=3), played_in("delay:age=3"))
 
 
+def test_a_replay_is_too_old_after_its_first_round():
+    """Its window comes again and again, so that the age of what arrives grows."""
+    trace = played_in("replay:window=3,start_step=60", authenticated=FIELDS, key_interval=3)
+    hit = (trace.kind != 0).sum(axis=0)
+    assert (hit > 0).all() and trace.refused.any() and (trace.kind[np.argmax(trace.kind != 0, axis=0)[0]][0] != 0)
+    rounds = [int(np.diff(np.flatnonzero(np.diff(np.concatenate([[0], column != 0, [0]]).astype(int))))[0]) for column in trace.kind.T]
+    assert set(rounds) == {3}
+
+
 def test_other_wires_stay_open():
     attack = "fdi:value=10,targets=[leader_acceleration]"
     assert same(played_in(attack, authenticated=["predecessor_command"]), played_in(attack))

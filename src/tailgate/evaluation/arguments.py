@@ -1,4 +1,4 @@
-"""What `evaluate` is asked for: one or several, as names or objects."""
+"""The arguments of `evaluate`: one or several, as names or objects."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _taken(place: Scenario) -> bool:
 
 
 def distinct(members: Iterable[tuple[str, object]], field: str) -> None:
-    """Raise InputError where the texts of two different objects are equal: their rows could not be told apart."""
+    """Raise InputError where the texts of two different objects are equal: nobody could tell their rows apart."""
     held: dict[str, object] = {}
     for text, one in members:
         if text in held and held[text] is not one and not (isinstance(one, str) or held[text] == one):
