@@ -39,8 +39,9 @@ def editable(module: str) -> bool:
     return file is None or not {"site-packages", "dist-packages"} & set(Path(file).parts)
 
 
-def _imported(file: Path, package: str) -> list[str]:
-    """Return the names of modules that a file may import, and of what may be modules in them."""
+@functools.lru_cache(maxsize=256)
+def _imported(file: Path, package: str, changed: int) -> list[str]:
+    """Return the names of modules that a file may import, and of what may be modules in them. `changed`: when it was [ns]."""
     try:
         tree = ast.parse(file.read_bytes())
     except (SyntaxError, ValueError):
@@ -67,5 +68,5 @@ def files_of(value: object) -> list[Path]:
         seen.add(name)
         if (file := getattr(module, "__file__", None)) and Path(file).is_file():
             found[name] = Path(file)
-            left += _imported(found[name], str(module.__package__ or "")) if editable(name) else []
+            left += _imported(found[name], str(module.__package__ or ""), found[name].stat().st_mtime_ns) if editable(name) else []
     return [*list(found.values())[:1], *sorted(list(found.values())[1:])]
