@@ -50,13 +50,22 @@ def test_a_failure_after_the_end_costs_no_other_row(plain):
 
 
 @pytest.mark.parametrize(("field", "value"), [
-    ("horizon", True), ("horizon", "600"), ("threat_model", {"budget": True}), ("threat_model", {"fdi_bound": True}),
+    ("horizon", True), ("horizon", "600"), ("threat_model", {"memory": True}), ("threat_model", {"budget": True}), ("threat_model", {"fdi_bound": True}),
     ("plant", {"name": "car_following", "dt": 0.1, "gap": "85.5"}),
 ])  # fmt: skip
 def test_words_and_truths_are_no_numbers(field, value):
     data = {"name": "odd", "plant": {"name": "car_following", "dt": 0.1}, "sensor": "odometry", "controller": "acc", "manoeuvre": "constant", "horizon": 10}
     with pytest.raises(InputError, match="a number"):
         load_scenario(data | {field: value})
+
+
+def test_numbers_with_an_exponent_are_numbers(tmp_path):
+    """YAML 1.1 takes 1e2 for text."""
+    (tmp_path / "odd.yaml").write_text(
+        "plant: {name: car_following, dt: 1e-1}\nsensor: odometry\ncontroller: acc\nmanoeuvre: constant\nhorizon: 10\nthreat_model: {kinds: [fdi], fdi_bound: 1e2}\n"
+    )
+    place = load_scenario(str(tmp_path / "odd.yaml"))
+    assert (place.plant.dt, place.threat_model.fdi_bound) == (0.1, 100.0)
 
 
 @pytest.mark.parametrize(("truth", "words"), [({"plant": {"dt": 0.05}}, "clock"), ({"latency": 10**9}, "10000")])

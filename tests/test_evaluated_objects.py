@@ -16,7 +16,7 @@ from tailgate.core.schema import as_data, digest
 from tailgate.evaluation.rows import read_rows
 from tailgate.evaluation.summary import summarise
 
-HELPED = "from helper_of_test import GAIN\nfrom tailgate.estimators.filters.kalman import KalmanFilter\n\n\nclass Helped:\n    gain = GAIN\n"
+HELPED = "from helper_of_test import GAIN\nfrom tailgate.estimators.filters.kalman import KalmanFilter\n\n\nclass Helped:\n    gain = GAIN\n    def later(self):\n        import lazy_of_test\n"
 
 
 class Tuned:
@@ -42,6 +42,8 @@ def test_two_objects_of_one_text_are_refused():
         tailgate.evaluate(scenarios=_short(), defences=[one, two], attacks="none", seeds=1)
     rows = tailgate.evaluate(scenarios=_short(), defences=[tailgate.make_defence("kf")] * 2, attacks="none", seeds=1)
     assert len(rows) == 2
+    for attacks in (["none", tailgate.make_attack("none")], [tailgate.make_attack("none"), "none"]):
+        assert len(tailgate.evaluate(scenarios=_short(), defences="kf", attacks=attacks, seeds=1)) == 2
 
 
 def test_rows_of_objects_do_not_replace_others(tmp_path):
@@ -50,6 +52,9 @@ def test_rows_of_objects_do_not_replace_others(tmp_path):
     tailgate.evaluate(scenarios=_short(), defences=tailgate.make_defence("imm"), attacks="none", seeds=1, out=out)
     assert [row["seed"] for row in read_rows(tmp_path / "rows.jsonl.1")] == [0, 1, 2] == [row["seed"] for row in first]
     assert len(read_rows(out)) == 1
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(InputError, match="a file, not a directory"):
+        tailgate.evaluate(scenarios=_short(), defences=tailgate.make_defence("imm"), attacks="none", seeds=1, out=tmp_path / "folder")
 
 
 def test_numbers_of_numpy_are_part_of_a_hash():
@@ -72,10 +77,13 @@ def test_a_changed_helper_is_noticed(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     found = []
     Path("helped_of_test.py").write_text(HELPED)
+    Path("lazy_of_test.py").write_text("")
     for gain in (0.1, 0.9):
         Path("helper_of_test.py").write_text(f"GAIN = {gain}  # {'x' * int(100 * gain)}\n")
-        for name in ("helped_of_test", "helper_of_test"):
+        for name in ("helped_of_test", "helper_of_test", "lazy_of_test"):
             sys.modules.pop(name, None)
         importlib.invalidate_caches()
         found.append(tailgate.core.registry.Spec("defence", "helped_of_test:Helped").digest)
     assert len(set(found)) == 2
+    importlib.import_module("lazy_of_test")  # as a step may do: what is loaded by now changes no digest
+    assert tailgate.core.registry.Spec("defence", "helped_of_test:Helped").digest == found[-1]

@@ -104,7 +104,7 @@ def test_times_that_are_rounded_keep_their_samples(name):
     noise = np.random.default_rng(0).standard_normal(len(t))
     found = checked(Raw("", told, 30.0 + 0.15 * noise, 0.0 * t, 20.0 + 0.0 * t), "here")
     gap = found.segments[0].gap
-    assert found.samples == len(t) and abs(found.dt - dt) < 1e-6
+    assert found.samples == len(t) and abs(found.dt / dt - 1.0) < 5e-4  # four digits, so that one rate is one number
     assert np.corrcoef(gap, noise)[0, 1] > 0.98 and abs(gap.std() / (0.15 * noise.std()) - 1.0) < 0.05
     assert grain or found.repairs == {}
 

@@ -13,6 +13,7 @@ from tailgate.core import Estimate, Mode, draws, param
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
 from tailgate.engine.agreement import Untraced
+from tailgate.engine.parameters import Parameters
 from tailgate.play.commanded import commanded
 from tailgate.play.trace import rollout
 
@@ -229,3 +230,56 @@ def test_what_a_function_closes_over_is_part_of_the_program(monkeypatch):
 
 
 LAW: dict[str, Any] = {}
+
+
+TABLE: dict[int, np.ndarray] = {}
+
+
+class Remembers(Habit):
+    """Constants in a mapping of its own, in one of its module, and in its class; and a sum that is not traced."""
+
+    w = None
+
+    def __init__(self):
+        self.table: dict[int, np.ndarray] = {}
+
+    def more(self, state, r):
+        for table in (self.table, TABLE):
+            if 10 not in table:
+                table[10] = np.ones(10) / 10.0
+        if Remembers.w is None:
+            Remembers.w = np.ones(10)
+        ring = np.concatenate([state.ring[:, :9], r[:, 0, :1]], axis=1) * self.table[10] * TABLE[10] * Remembers.w
+        return ring.sum(axis=-1)[:, None] + 0.0 * r[:, :, 0], state
+
+
+def test_what_code_remembers_of_a_trace_does_not_break_the_plain_loop():
+    assert "a sum of 10 numbers" in _played(Remembers(), 40)
+
+
+def test_a_constant_is_computed_once_however_often_its_code_is_traced():
+    window.cache_clear()
+    for _ in range(3):
+        assert _played(Cached(), 40) == ""
+    assert window.cache_info().misses == 1
+
+
+def test_numbers_of_a_closure_are_parameters():
+    def law(gain):
+        return lambda x: gain * x
+
+    first, second = (Parameters(law(gain)) for gain in (2.0, 3.0))
+    assert first.key == second.key and first.values != second.values
+
+
+def test_a_narrow_index_may_point_into_a_large_table():
+    """A mode into 200 entries."""
+
+    @dataclass(frozen=True)
+    class Table(Habit):
+        narrow = np.int8
+
+        def more(self, state, r):
+            return num.take(np.linspace(1.0, 2.0, 200), state.small[:, 0])[:, None] + 0.0 * r[:, :, 0], state._replace(small=state.small + np.int8(1))
+
+    assert _played(Table(), 60) == ""

@@ -112,9 +112,9 @@ class Duel:
             raise unknown("defender_action", defender_action, ("menu", "box"))
         if menu is not None and not isinstance(menu, (dict, Menu)):
             raise InputError("menu", menu, "a mapping of knobs to settings")
-        if isinstance(menu, dict) and "interval" in menu:
-            raise InputError("menu.interval", menu["interval"], "the argument interval: both decide at the same time")
         menu = menu if isinstance(menu, Menu) else build(Menu, dict(menu or {}), "menu")
+        if menu.interval != Menu().interval:
+            raise InputError("menu.interval", menu.interval, "the argument interval: both decide at the same time")
         interval = build(ActionSpec, {k: v for k, v in arguments.items() if k == "interval"}, "action").interval
         payoff = build(Payoff, {k: arguments.pop(k) for k in list(arguments) if k in fields_of(Payoff)}, "payoff")
         defence = FACES[CAR_FOLLOWING]["defence"] if defence is None else defence

@@ -115,6 +115,13 @@ def _several(seat: Seat) -> bool:
     return bool(seat.action.spec.interval > 1)
 
 
+def _played(seat: Seat) -> object:
+    """Play a step in the plain loop."""
+    check_open(seat.loop)
+    start, action = _example(seat), np.zeros(1, np.int64) if seat.action.discrete else np.zeros((1, seat.action.size))
+    return seat.advanced(start.loop, start.tally, seat.opened(start.tally), action, np.zeros(1, bool))
+
+
 def _shown_once(seat: Seat) -> Seat:
     """Return the seat as it is traced: it shows one frame."""
     return dataclasses.replace(seat, observation=type(seat.observation)(seat.loop.brief), config={})
@@ -166,6 +173,7 @@ def programs_of(seat: Seat, device: str = "cpu") -> SeatPrograms | Untraced:
     return _made.proved(
         (shown, device),
         lambda: (begun := _example(shown), _shown(shown, begun)),
+        lambda: _played(shown),
         lambda: SeatPrograms(seat, shown, device),
         lambda found, values: found.of(seat, values),
         difference,

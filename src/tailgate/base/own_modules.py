@@ -9,9 +9,11 @@ import ast
 import functools
 import os
 import sys
+from importlib.machinery import PathFinder
 from pathlib import Path
 
 _wanted = False
+_INSTALLED = {"site-packages", "dist-packages"}
 
 
 def allow() -> None:
@@ -36,37 +38,49 @@ def editable(module: str) -> bool:
     top, file = module.partition(".")[0], getattr(sys.modules.get(module), "__file__", None)
     if top in ("tailgate", "builtins") or (top in sys.stdlib_module_names and module != "__main__"):
         return False
-    return file is None or not {"site-packages", "dist-packages"} & set(Path(file).parts)
+    return file is None or not _INSTALLED & set(Path(file).parts)
 
 
 @functools.lru_cache(maxsize=256)
-def _imported(file: Path, package: str, changed: int) -> list[str]:
-    """Return the names of modules that a file may import, and of what may be modules in them. `changed`: when it was [ns]."""
+def _imported(file: Path, changed: int) -> list[tuple[int, str]]:
+    """Return what a file may import: how many folders up it is looked for (0: on the path), and names. `changed`: when it was [ns]."""
     try:
         tree = ast.parse(file.read_bytes())
     except (SyntaxError, ValueError):
         return []
-    out: list[str] = []
+    out: list[tuple[int, str]] = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            out += [alias.name for alias in node.names]
+            out += [(0, alias.name) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            above = package.split(".")
-            base = ".".join([*(above[: len(above) + 1 - node.level] if node.level else []), *([node.module] if node.module else [])])
-            out += [base, *(f"{base}.{alias.name}" for alias in node.names)]
-    return out
+            base = f"{node.module}." if node.module else ""
+            out += [(node.level, base.rstrip("."))] if base else []
+            out += [(node.level, f"{base}{alias.name}") for alias in node.names]
+    return list(dict.fromkeys(out))
+
+
+def _found(level: int, name: str, beside: Path) -> Path | None:
+    """Return the file of a module of somebody's, whether or not it is loaded; None for what is installed, or no module."""
+    if not level and name.partition(".")[0] in {"tailgate", *sys.stdlib_module_names}:
+        return None
+    above = str(beside.parents[level - 1]) if level else str(beside.parent)
+    places: list[str] | None = [above] if level else [*sys.path, *folders(), above]
+    for part in name.split("."):
+        spec = PathFinder.find_spec(part, places)
+        if spec is None:
+            return None
+        places = list(spec.submodule_search_locations or [])
+    file = Path(spec.origin) if spec is not None and spec.origin else None
+    return file if file is not None and file.is_file() and not _INSTALLED & set(file.parts) else None
 
 
 def files_of(value: object) -> list[Path]:
-    """Return the files that somebody's class or function comes from, its own first: those of its bases and of what its module imports."""
-    bases = getattr(value, "__mro__", (value,))
-    left, seen, found = [str(base.__module__) for base in bases], set[str](), dict[str, Path]()
-    for name in left:  # which grows
-        module = sys.modules.get(name)
-        if module is None or name in seen or not (editable(name) or name == left[0]):
-            continue
-        seen.add(name)
-        if (file := getattr(module, "__file__", None)) and Path(file).is_file():
-            found[name] = Path(file)
-            left += _imported(found[name], str(module.__package__ or ""), found[name].stat().st_mtime_ns) if editable(name) else []
-    return [*list(found.values())[:1], *sorted(list(found.values())[1:])]
+    """Return the files that somebody's class or function comes from, its own first: those of its bases, and what these import."""
+    bases = [str(base.__module__) for base in getattr(value, "__mro__", (value,))]
+    own = [getattr(sys.modules.get(name), "__file__", None) for i, name in enumerate(bases) if i == 0 or editable(name)]
+    found = [file for file in map(Path, filter(None, own)) if file.is_file()]
+    for file in found:  # which grows
+        if not _INSTALLED & set(file.parts):
+            more = (_found(level, name, file) for level, name in _imported(file, file.stat().st_mtime_ns))
+            found += [one for one in dict.fromkeys(more) if one is not None and one not in found]
+    return list(dict.fromkeys(found[:1] + sorted(found[1:])))

@@ -9,6 +9,7 @@ import copy
 import errno
 import json
 import lzma
+import re
 import sys
 from collections.abc import Callable, Iterator
 from functools import lru_cache
@@ -217,6 +218,11 @@ class _Plain(yaml.SafeLoader):
 
 _KINDS = {f"tag:yaml.org,2002:{kind}" for kind in ("null", "bool", "int", "float", "str", "seq", "map")}
 _Plain.yaml_constructors = {tag: made for tag, made in yaml.SafeLoader.yaml_constructors.items() if tag in _KINDS} | {None: _Plain.no_value}
+
+
+_Plain.yaml_implicit_resolvers = {key: list(held) for key, held in yaml.SafeLoader.yaml_implicit_resolvers.items()}
+_EXPONENT = re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+$")  # a number without a point, which YAML 1.1 takes for text
+_Plain.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT, list("-+0123456789"))
 
 
 def parse_yaml(text: str) -> Any:

@@ -86,5 +86,6 @@ def _print(report: dict[str, Any]) -> None:
             figures = f"{shown(gain['value'], share, '+')} ({between(gain, share, '+')})"
             say(f"flag: {flag}: {entry['trained_on']} on {entry['played_on']}, {figures}")
     for reason in dict.fromkeys(item["reason"] for item in report["skipped"]):
-        names = ", ".join(item.get("policy", item.get("defence")) for item in report["skipped"] if item["reason"] == reason)
+        mine = [item for item in report["skipped"] if item["reason"] == reason]
+        names = ", ".join(" on ".join(item[key] for key in ("policy", "defence") if key in item) for item in mine)
         say(f"skipped: {names}: {reason}")

@@ -8,8 +8,10 @@ import hashlib
 import importlib
 import inspect
 import json
+import operator
 import warnings
 from collections.abc import Callable, Iterable
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
@@ -185,13 +187,13 @@ def fitting(family: Family, value: object) -> type:
 def entry_of(family: Family, name: str, cls: type) -> Entry:
     """Return an entry for somebody else's class, which may carry `uses`, `reference` and `version` as class attributes."""
     uses, version = getattr(cls, "uses", ("measurements",)), getattr(cls, "version", 1)
-    if isinstance(uses, str) or not isinstance(uses, tuple | list) or not all(isinstance(use, str) for use in uses):
+    if isinstance(uses, str) or not isinstance(uses, Iterable) or not all(isinstance(use, str) for use in uses):
         raise InputError(f"{name}.uses", uses, "several names, such as ('measurements', 'v2v')")
-    check_uses(name, uses := tuple(uses))
-    if isinstance(version, bool) or not isinstance(version, int):
+    check_uses(name, uses := tuple(sorted(uses) if isinstance(uses, AbstractSet) else uses))
+    if not hasattr(version, "__index__"):
         raise InputError(f"{name}.version", version, "a whole number")
     return Entry(
-        family, name, cls, version=version, reference=str(getattr(cls, "reference", "")), uses=uses,
+        family, name, cls, version=operator.index(version), reference=str(getattr(cls, "reference", "")), uses=uses,
         knowledge=str(getattr(cls, "knowledge", "black")),
     )  # fmt: skip
 
@@ -335,13 +337,13 @@ class Spec:
             return digest_of(self.sandboxed[1])
         head, params = self._parts()
         paths = [path for family, name in self._imported() for path in own_modules.files_of(imported(family, name).cls)]
-        paths += [Path(inspect.getfile(find(family, name).cls)) for family, name in self._plugged() if family in PARTS]
+        paths += [path for family, name in self._plugged() if family in PARTS for path in own_modules.files_of(find(family, name).cls)]
         if self.family == "attack":
             paths = [Path(str(text)) for text in (head, params.get("path")) if Path(str(text)).suffix in _FILES] or paths
         if self.family == "defence" and (held := params.get("policy")) is not None:  # a defender that was trained
             paths += [Path(str(path)) for path in (held if isinstance(held, list) else [held])]
         if not paths and not self.entry.built_in:
-            paths = [Path(inspect.getfile(self.entry.cls))]
+            paths = own_modules.files_of(self.entry.cls)
         if not paths and hasattr(self.entry.cls, "sources"):  # a name of a file
             paths = list(self.make().sources)
         if self.family == "defence" and len(paths) == 1 and (":" in head or not self.entry.built_in):

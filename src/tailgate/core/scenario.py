@@ -108,8 +108,6 @@ def _check_truth(truth: dict[str, Any], where: str) -> None:
         if key not in ("plant", "sensor", "load", *LINK):
             raise unknown(f"{where}: unknown field", key, ("plant", "sensor", "load", *LINK))
     load = truth.get("load", 1.0)
-    if isinstance(plant := truth.get("plant"), dict) and "dt" in plant:
-        raise InputError(f"{where}.plant.dt", plant["dt"], "none: clock and manoeuvre have the scenario's")
     if isinstance(load, bool) or not isinstance(load, int | float) or not 0.1 <= load <= 10.0:
         raise InputError(f"{where}.load", load, "the mass over the nominal one, 0.1 to 10")
 
@@ -236,6 +234,9 @@ def _made(data: dict[str, Any], path: Path) -> Scenario:
     rest |= {"name": data.get("name", path.stem), "threat_model": build(ThreatModel, threat, f"{where}.threat_model")}
     scenario = build(Scenario, parts | rest, where)
     _check_truth(scenario.truth, f"{where}.truth")
+    told, dt = scenario.truth.get("plant"), getattr(scenario.plant, "dt", None)
+    if isinstance(told, dict) and told.get("dt", dt) != dt:
+        raise InputError(f"{where}.truth.plant.dt", told["dt"], f"{dt}, as clock and manoeuvre have it")
     return scenario
 
 

@@ -8,7 +8,7 @@ import types
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
@@ -82,6 +82,9 @@ def build(cls: type[T], data: dict[str, Any], where: str) -> T:
             raise unknown(f"{where}: unknown field", key, known)
     if not known:
         return _made(cls, {}, where)
+    for key in _numeric(cls):  # type: ignore[arg-type]
+        if (found := _wordy(data.get(key), (key,))) is not None:
+            raise InputError(f"{where}.{'.'.join(map(str, found[0]))}", found[1], "a number")
     try:
         adapter = _adapter(cls)  # type: ignore[arg-type]
     except PydanticSchemaGenerationError:  # a plug-in with fields that are not data: its own constructor decides
@@ -95,6 +98,30 @@ def build(cls: type[T], data: dict[str, Any], where: str) -> T:
         path = ".".join(str(part) for part in first["loc"]) or cls.__name__
         unit = _unit(known, first["loc"]) if first["type"].startswith(("greater", "less")) else ""
         raise InputError(f"{where}.{path}", first["input"], f"{wanted(first)}{unit}") from None
+
+
+@cache
+def _numeric(cls: type) -> frozenset[str]:
+    """Return the fields that hold numbers, or tuples of them, and nothing else but none."""
+    try:
+        hints = get_type_hints(cls)
+    except (NameError, TypeError):  # a plug-in with names that only a type checker knows
+        return frozenset()
+    return frozenset(name for name in fields_of(cls) if name in hints and _of_numbers(hints[name]))
+
+
+def _of_numbers(kind: object) -> bool:
+    if kind in (int, float):
+        return True
+    inner = [part for part in get_args(kind) if part not in (types.NoneType, ...)]
+    return get_origin(kind) in (tuple, Union, types.UnionType) and bool(inner) and all(map(_of_numbers, inner))
+
+
+def _wordy(value: object, place: tuple[int | str, ...]) -> tuple[tuple[int | str, ...], object] | None:
+    """Return place and value of a word or a truth value among numbers: YAML's yes and on, and quoted numbers, which nobody means."""
+    if isinstance(value, list | tuple):
+        return next((found for i, part in enumerate(value) if (found := _wordy(part, (*place, i))) is not None), None)
+    return (place, value) if isinstance(value, bool | str) else None
 
 
 def _unit(known: dict[str, Any], place: tuple[int | str, ...]) -> str:
@@ -128,7 +155,9 @@ def as_data(value: object) -> Any:
     if isinstance(value, (types.NoneType, bool, int, float, str)):
         return value
     if isinstance(value, np.generic):
-        return as_data(value.item())
+        return str(value) if isinstance(value.item(), np.generic) else as_data(value.item())
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        return as_data(value.tolist())
     if isinstance(value, np.ndarray):
         return {"array": [value.dtype.str, list(value.shape), hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()]}
     if isinstance(value, Path):  # what the file says counts, not where it lies

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 S = TypeVar("S")
+L = TypeVar("L", bound="Defended")
 TRIED, ROWS = 24, 64  # steps and episodes in which new code is compared with the plain loop
 
 
@@ -36,11 +37,12 @@ class Defended(Protocol):
         """The loop's defence."""
 
 
-def check_open(loop: Defended) -> None:
-    """Raise TypeError for a defence that runs in another process or declares itself untraceable."""
+def check_open(loop: L) -> L:
+    """Return the loop. Raise TypeError for a defence that runs in another process or declares itself untraceable."""
     defence = loop.defence
     if why := getattr(defence, "opaque", "") or getattr(defence, "untraced", ""):
         raise TypeError(f"the defence {type(defence).__name__} is not traced: {why}")
+    return loop
 
 
 def explained(error: Exception) -> str:

@@ -114,6 +114,7 @@ def _counted(place: Array, size: int) -> Array:
     """Return places counted from the first one, where negative ones count from behind the last, as numpy does."""
     if not isinstance(place, Traced) or place.dtype.kind in "ub":
         return place
+    place = place.astype(np.int64, copy=False)  # a narrow number may not hold the size
     return np.where(place < 0, place + size, place)
 
 

@@ -18,7 +18,7 @@ import weakref
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import PurePath
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from tailgate.engine.graph import Graph, Node, ordered
 from tailgate.engine.operations import FLOAT, Array
 
 T = TypeVar("T")
+MANY = 100  # numbers of a list that are compared by their bytes
 LARGE = 20_000  # numbers of an array that is used as it is, because code usually reads few of them
 _caches: weakref.WeakSet[Any] = weakref.WeakSet()  # of somebody's functions that traced code calls
 _PLAIN = (type(None), str, bytes, int, complex, enum.Enum, np.generic, np.dtype, type, types.BuiltinFunctionType, np.ufunc, PurePath)
@@ -41,6 +42,22 @@ def lifted(like: Array, held: T) -> T:
     return cast(T, _Reader(like.graph).visit(held))
 
 
+class Snapshot(NamedTuple):
+    """The content of objects at a time."""
+
+    code: tuple[Any, ...]
+    values: list[bytes]
+    objects: list[tuple[Any, dict[str, Any]]]  # those that may change, with their attributes
+
+    def changed(self, now: Snapshot) -> str:
+        """Return which object has changed since, by its class and attribute, or that a global has; empty if none."""
+        for (one, before), (_, after) in zip(self.objects, now.objects, strict=False):
+            for name in after:
+                if before.get(name) != after[name]:
+                    return f"{type(one).__name__}.{name}"
+        return "" if self[:2] == now[:2] else "a global"
+
+
 class Parameters:
     """The parameters of objects: equal `key`s share code, whatever their `values`. The key of mutable objects is None."""
 
@@ -50,9 +67,8 @@ class Parameters:
         self.values = reader.values
         self._classes = reader.classes
         self.kept = reader.kept  # objects known by their id must live as long as the key
-        self.attributes = reader.attributes
-        self.whole = (*reader.key, *(leaf.tobytes() for leaf in reader.values))
-        self.key = None if reader.changeable else tuple(reader.key)
+        self.code = tuple(reader.key)
+        self.key = None if reader.changeable else self.code
 
     @property
     def sources(self) -> str:
@@ -62,29 +78,28 @@ class Parameters:
             digest.update(file.read_bytes())
         return digest.hexdigest()
 
-    def changed(self, held: object) -> str:
-        """Return which of these objects has changed since, by its class and attribute, or that a global has; empty if none."""
-        now = Parameters(held)
-        if now.whole == self.whole:
-            return ""
-        for one, before, after in zip(self.kept, self.attributes, now.attributes, strict=False):
-            for name in after:
-                if before.get(name) != after[name]:
-                    return f"{type(one).__name__}.{name}"
-        return "a global"
+    def snapshot(self) -> Snapshot:
+        """Return what the objects and the code that they name hold now."""
+        held = [(one, {name: _value(part, set()) for name, part in vars(one).items()}) for one in self._objects]
+        return Snapshot(self.code, [leaf.tobytes() for leaf in self.values], held)
+
+    @property
+    def _objects(self) -> list[Any]:
+        return [one for one in self.kept if hasattr(one, "__dict__") and not isinstance(one, types.FunctionType)]
 
     @contextlib.contextmanager
     def restored(self) -> Iterator[None]:
-        """Give objects their attributes of before back after a trace, and empty caches of functions: nodes may have come into them."""
-        before = [(one, dict(vars(one))) for one in self.kept if hasattr(one, "__dict__") and not isinstance(one, types.FunctionType)]
+        """Give objects their attributes of before back after a trace, and empty caches that were filled in it: they hold nodes."""
+        before, caches = [(one, dict(vars(one))) for one in self._objects], {cache: cache.cache_info().misses for cache in list(_caches)}
         try:
             yield
         finally:
             for one, attributes in before:
                 vars(one).clear()
                 vars(one).update(attributes)
-            for cache in list(_caches):
-                cache.cache_clear()
+            for cache, misses in caches.items():
+                if cache.cache_info().misses != misses:
+                    cache.cache_clear()
 
 
 class Reading:
@@ -155,7 +170,6 @@ class _Reader:
         self.values: list[Array] = [] if graph is None else graph.parameters
         self.kept: list[Any] = []
         self.classes: dict[Any, None] = {}
-        self.attributes: list[dict[str, Any]] = []  # of `kept`
         self.changeable = False
         self._known: dict[int, tuple[int, Any, Any]] = {}
 
@@ -202,8 +216,7 @@ class _Reader:
             return self._function(held)
         if not dataclasses.is_dataclass(held):
             self.kept.append(held)
-            self.attributes.append({name: _value(part, set()) for name, part in getattr(held, "__dict__", {}).items()})
-            self.key += [id(held), *self.attributes[-1].items()]
+            self.key.append(id(held))
             self.changeable = self.changeable or not isinstance(held, frozenset)
             return held
         self.changeable = self.changeable or not _frozen(type(held))
@@ -228,7 +241,6 @@ class _Reader:
 
     def _function(self, held: types.FunctionType) -> Any:
         self.kept.append(held)
-        self.attributes.append({})
         self.key += [held.__code__, id(held.__globals__), read_by(held)]
         self.classes[held] = None
         defaults, named = self.visit(held.__defaults__), self.visit(held.__kwdefaults__)
@@ -273,10 +285,11 @@ def _code_of(kind: type) -> tuple[Any, ...]:
 
 def read_by(function: types.FunctionType) -> tuple[Any, ...]:
     """Return the globals and defaults that somebody else's function reads, and so on: they may change while the process runs."""
-    return _read(function, set()) if editable(str(function.__module__)) else ()
+    return _read(function, set(), cells=False) if editable(str(function.__module__)) else ()
 
 
-def _read(function: types.FunctionType, seen: set[int]) -> tuple[Any, ...]:
+def _read(function: types.FunctionType, seen: set[int], cells: bool = True) -> tuple[Any, ...]:
+    """Return the globals, defaults and cells that a function reads; without `cells`, where these are parameters."""
     if id(function) in seen:
         return ()
     seen.add(id(function))
@@ -288,8 +301,8 @@ def _read(function: types.FunctionType, seen: set[int]) -> tuple[Any, ...]:
     for name, module in list(held):  # what is read of somebody's module by its name
         if isinstance(module, types.ModuleType) and editable(module.__name__):
             held += [(f"{name}.{part}", vars(module)[part]) for part in dict.fromkeys(names) if part in vars(module)]
-    cells = [cell for cell in function.__closure__ or () if _filled(cell)]
-    given = [*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values(), *(cell.cell_contents for cell in cells)]
+    inside = [cell.cell_contents for cell in function.__closure__ or () if cells and _filled(cell)]
+    given = [*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values(), *inside]
     return function.__code__, *((name, _value(value, seen)) for name, value in held), *(_value(value, seen) for value in given)
 
 
@@ -329,6 +342,8 @@ def _value(held: object, seen: set[int]) -> Any:
         if id(held) in seen:  # it may hold itself
             return "again"
         seen.add(id(held))
+        if len(held) > MANY and not isinstance(held, dict) and all(type(part) in (int, float) for part in held):
+            return type(held), np.asarray(held).dtype.str, np.asarray(held).tobytes()
         parts = held.items() if isinstance(held, dict) else enumerate(held)
         return type(held), *((repr(key), _value(part, seen)) for key, part in parts)
     if isinstance(held, np.ndarray) and held.dtype != object:

@@ -55,8 +55,8 @@ class Remembered(Generic[T]):
         self._lock = threading.Lock()
 
     def proved(
-        self, held: object, begin: Callable[[], object], make: Callable[[], T], adopt: Callable[[T, list[Array]], T],
-        difference: Callable[[T], str],
+        self, held: object, begin: Callable[[], object], play: Callable[[], object], make: Callable[[], T],
+        adopt: Callable[[T, list[Array]], T], difference: Callable[[T], str],
     ) -> T | Untraced:  # fmt: skip
         """Return programs that equal the plain loop on this machine, or the reason why there are none.
 
@@ -64,6 +64,7 @@ class Remembered(Generic[T]):
         ----------
         held : the objects whose parameters the programs use
         begin : returns the first state, and lets the objects compute what they cache, because that is among their parameters
+        play : plays a step plainly, so that what code remembers of it is numbers and no nodes
         make : traces and compiles the programs
         adopt : adapts cached programs to other parameter values
         difference : names what differs from the plain loop; empty if nothing does
@@ -74,19 +75,21 @@ class Remembered(Generic[T]):
             key = None if parameters.key is None else (form, parameters.key)
             if found := self._find(key, parameters):
                 return adopt(found, parameters.values)
+            play()
+            first = Parameters(held).snapshot()
             with parameters.restored():
                 made = make()
         except Exception as error:  # a plug-in may raise anything when arrays are not numpy's
             return Untraced(explained(error))
         names = [f"{program.function.name}.{parameters.sources}" for program in made.programs]
-        if key is None or not objects.proved(names):
+        if not objects.proved(names):
             if differs := difference(made):
                 return Untraced(f"traced code and the plain loop differ in {differs}")
-            if parameters.changed(held):  # once, as a cache that is filled, or in every step?
+            if first.changed(Parameters(held).snapshot()):  # once, as a cache that is filled, or in every step?
                 begin()
-                before = Parameters(held)
+                before = Parameters(held).snapshot()
                 difference(made)
-                if wrote := before.changed(held):
+                if wrote := before.changed(Parameters(held).snapshot()):
                     return Untraced(f"a step writes to {wrote}: keep what changes in the state that start returns")
             objects.prove(names)
         self._keep(key, parameters, [program.trace.graph for program in made.programs], made)

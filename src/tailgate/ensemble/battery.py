@@ -197,7 +197,8 @@ def battery_of(loop: Loop, attack: Decider, plan: object, few: object) -> Batter
     """
     one = map_leaves(lambda leaf: leaf[:1], few)
     return _made.proved(
-        (loop, attack, plan), lambda: _sensed(loop, begun(loop, _keys(1), one)), lambda: Battery(loop, attack, plan, one),
+        (loop, attack, plan), lambda: _sensed(loop, begun(loop, _keys(1), one)),
+        lambda: step(check_open(loop), attack, plan, begun(loop, _keys(1), one)), lambda: Battery(loop, attack, plan, one),
         lambda found, values: found.of(loop, attack, plan, values), lambda made: _difference(made, few),
     )  # fmt: skip
 

@@ -9,7 +9,9 @@ from typing import Any
 
 from tailgate.base.errors import InputError
 from tailgate.base.reading import YAML_ENDS
+from tailgate.core.registry import Family, Spec
 from tailgate.core.scenario import Scenario, ScenarioLike, list_scenarios, load_scenario
+from tailgate.core.schema import canonical
 
 
 def several(value: object) -> list[Any]:
@@ -39,10 +41,15 @@ def _taken(place: Scenario) -> bool:
     return dataclasses.replace(place, threat_model=known.threat_model).config_hash != known.config_hash
 
 
-def distinct(members: Iterable[tuple[str, object]], field: str) -> None:
+def _equal(family: Family, one: object, other: object) -> bool:
+    a, b = (Spec(family, part).make() if isinstance(part, str) else part for part in (one, other))
+    return type(a) is type(b) and dataclasses.is_dataclass(a) and canonical(a) == canonical(b)
+
+
+def distinct(family: Family, members: Iterable[tuple[str, object]]) -> None:
     """Raise InputError where the texts of two different objects are equal: nobody could tell their rows apart."""
     held: dict[str, object] = {}
     for text, one in members:
-        if text in held and held[text] is not one and not (isinstance(one, str) or held[text] == one):
-            raise InputError(field, text, "objects whose text differs: a dataclass's has its fields")
+        if text in held and held[text] is not one and not _equal(family, held[text], one):
+            raise InputError(f"{family}s", text, "objects whose text differs: a dataclass's has its fields")
         held[text] = one

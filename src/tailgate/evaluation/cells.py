@@ -20,7 +20,7 @@ import numpy as np
 
 from tailgate.base import own_modules, sizes, sources
 from tailgate.base.errors import InputError, NotApplicable, known_arguments
-from tailgate.base.files import set_aside, write_atomic
+from tailgate.base.files import set_aside, writable_directory, write_atomic
 from tailgate.base.locks import alone
 from tailgate.base.pool import apart, each
 from tailgate.base.reading import YAML_ENDS
@@ -355,25 +355,30 @@ def evaluate(
         if not value:
             raise InputError(name, list(value), "at least one")
     for dose in named.doses:
-        if dose is not None and (not isinstance(dose, int) or dose < 0):
+        if dose is not None and (isinstance(dose, bool) or not isinstance(dose, int) or dose < 0):
             raise InputError("dose", dose, "a whole number of attack steps, not below 0")
-    distinct([(component("defence", one)[2], one) for one in defences], "defences")
-    distinct([(component("attack", one)[2], one) for one in attacks], "attacks")
-    own = tuple(several(metrics))
+    distinct("defence", [(component("defence", one)[2], one) for one in defences])
+    distinct("attack", [(component("attack", one)[2], one) for one in attacks])
+    own, place = tuple(several(metrics)), Path(out) if out is not None else None
+    objects = not all(isinstance(one, str) for one in (*defences, *attacks))
+    if place is not None and objects:
+        writable_directory(place.parent, asked=place)
+        if place.is_dir():
+            raise InputError("out", str(place), "a file, not a directory")
     cells = cells_of(named, batch=batch, purpose=purpose, threat=threat, beacon=beacon, metrics=own, given=given)
-    rows = run(cells, Path(out) if out is not None else None, workers, progress) if cells else []
-    for defence in defences:
-        for attack in attacks:
-            if isinstance(defence, str) and isinstance(attack, str):
-                continue
-            guard, adversary = component("defence", defence)[2], component("attack", attack)[2]
-            for scenario in named.scenarios:
-                for dose in named.doses:
-                    rest = named.seeds, purpose, 0, batch, named.granted | dict(threat or {}), beacon, own, given.get(scenario)
-                    rows += run_cell(Cell(named.name, scenario, dose, guard, adversary, *rest), defence, attack)
-    if out is not None and len(rows) > sum(cell.seeds for cell in cells):
-        with alone(Path(out)):
-            if not cells and Path(out).exists():  # else `run` has set aside what was there
-                set_aside(Path(out))
-            write_atomic(Path(out), packed(rows, Path(out)))  # with the rows of objects
+    rows = run(cells, place, workers, progress) if cells else []
+    with alone(place) if place is not None and objects else contextlib.nullcontext():
+        for defence in defences:
+            for attack in attacks:
+                if isinstance(defence, str) and isinstance(attack, str):
+                    continue
+                guard, adversary = component("defence", defence)[2], component("attack", attack)[2]
+                for scenario in named.scenarios:
+                    for dose in named.doses:
+                        rest = named.seeds, purpose, 0, batch, named.granted | dict(threat or {}), beacon, own, given.get(scenario)
+                        rows += run_cell(Cell(named.name, scenario, dose, guard, adversary, *rest), defence, attack)
+        if place is not None and objects:
+            if not cells and place.exists():  # else `run` has set aside what was there
+                set_aside(place)
+            write_atomic(place, packed(rows, place))
     return Rows(rows)

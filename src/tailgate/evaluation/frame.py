@@ -7,8 +7,8 @@ from html import escape
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from tailgate.evaluation.rows import KEYS, Row
-from tailgate.evaluation.summary import summarise
+from tailgate.evaluation.rows import Row
+from tailgate.evaluation.summary import cell_of, summarise
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -63,7 +63,7 @@ class Rows(list[Row]):
         return f"{html_table(COLUMNS, map(_line, entries[:SHOWN]))}{more}"
 
     def __repr__(self) -> str:
-        cells = len({tuple(row[key] for key in KEYS) for row in self})
+        cells = len({cell_of(row) for row in self})
         return f"Rows of {len(self):,} episodes in {cells:,} cells; a list of mappings, .summary(), .to_pandas()"
 
 

@@ -14,6 +14,11 @@ ENTRY = ("n", "failed", "crash", "refused_all")  # keys of an entry that are no 
 FIGURES = ("min_gap", "max_error", "rmse_position", "alarm_onsets", "alarm_rate", "attack_steps", "refused_commands")
 
 
+def cell_of(row: dict[str, Any]) -> tuple[Any, ...]:
+    """Return the part of a row that tells its cell from others."""
+    return (*(row[key] for key in KEYS), *(repr(row.get(name)) for name in IF_ANY))
+
+
 def summarise(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return one entry per cell (the columns of rows.KEYS, and of IF_ANY), in order of appearance; of repeated seeds the last row counts.
 
@@ -23,8 +28,7 @@ def summarise(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """
     groups: dict[tuple[Any, ...], dict[int, dict[str, Any]]] = {}
     for row in rows:
-        key = (*(row[key] for key in KEYS), *(repr(row.get(name)) for name in IF_ANY))
-        groups.setdefault(key, {})[row["seed"]] = row
+        groups.setdefault(cell_of(row), {})[row["seed"]] = row
     out = []
     for key, by_seed in groups.items():
         members = list(by_seed.values())

@@ -132,6 +132,7 @@ def commanded(loop: Loop) -> Commanded | Untraced:
     return _made.proved(
         (loop, device()),
         lambda: (begun := _first(loop), _seen(loop, begun)),
+        lambda: check_open(loop).advance(_first(loop), _nothing(loop, 1)),
         lambda: Commanded(loop),
         lambda found, values: found.of(loop, values),
         _difference,

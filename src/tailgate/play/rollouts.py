@@ -110,6 +110,7 @@ def rollout_of(loop: Loop, attack: Attack) -> Rollout | Untraced:
     return _made.proved(
         (loop, attack, plan, device()),
         lambda: _sensed(loop, _begun(loop, attack, plan, _ONE)),
+        lambda: _step(check_open(loop), attack, plan, _begun(loop, attack, plan, _ONE)),
         lambda: Rollout(loop, attack, plan),
         lambda found, values: found.of(loop, attack, plan, values),
         _difference,

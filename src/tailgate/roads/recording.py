@@ -117,7 +117,7 @@ def checked(raw: Raw, where: str) -> Recording:
         segments.append(_uniform(raw, part, dt, repairs))
     if not segments:
         raise InputError(f"{name}: time", f"{len(holes)} holes", f"a segment of {LEAST:g} s without a hole above {longest:g} s")
-    out = Recording(raw.name, dt, tuple(segments), repairs)
+    out = Recording(raw.name, float(f"{dt:.4g}"), tuple(segments), repairs)  # one rate is one number, however times are rounded
     if (absent := out.samples - sum(int(part.seen.sum()) for part in segments)) > MISSING * out.samples:
         raise InputError(f"{name}: gap", f"{absent} of {out.samples} missing or lost", f"at most {MISSING:.0%}")
     _meant(out, name)

@@ -96,6 +96,6 @@ def build_site(
     summary = {"format": SUMMARY, "title": title, "suites": [s.board.suite.name for s in suites], "entries": listed}
     files["summary.json"] = encoded(summary | {"sha256": dict(sorted(hashes.items()))}, "summary")
     for name, content in files.items():
-        write_atomic(folder / name, content)
+        (write_html if name.endswith(".html") else write_atomic)(folder / name, content)
     write_html(folder / "index.html", first)  # last: what it links to is there
     return folder / "index.html"

@@ -15,7 +15,7 @@ from markupsafe import Markup, escape
 from tailgate.base import sizes
 from tailgate.base.assets import templates
 from tailgate.base.errors import InputError, unknown
-from tailgate.base.files import writable_directory, write_atomic, write_json
+from tailgate.base.files import writable_directory, write_atomic, write_html, write_json
 from tailgate.base.reading import load_json
 from tailgate.base.version import VERSION
 
@@ -143,7 +143,7 @@ def write(report: Report, directory: Path, **stamp: object) -> Path:
         write_atomic(directory / f"{figure.name}.png", figure.png)
     write_atomic(directory / "report.md", markdown(report).encode())
     written = directory / "index.html"
-    write_atomic(written, html(report).encode())
+    write_html(written, html(report).encode())
     write_json(directory / "report.json", data)  # last: what was cut off has none
     return written
 

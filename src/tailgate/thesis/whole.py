@@ -11,7 +11,7 @@ from typing import Any
 
 from tailgate.base import sources
 from tailgate.base.errors import InputError
-from tailgate.base.files import sweep, writable_directory, write_atomic, write_json
+from tailgate.base.files import sweep, writable_directory, write_atomic, write_html, write_json
 from tailgate.base.locks import alone
 from tailgate.base.reading import load_json
 from tailgate.base.version import VERSION
@@ -177,7 +177,7 @@ def write_whole(whole: Whole, directory: Path) -> Path:
         raise InputError("coverage: figures", sorted(missing), "figures that a chapter draws")
     write_json(directory / "report.json", as_data(whole))
     write_atomic(directory / "report.md", markdown(whole).encode())
-    write_atomic(directory / "index.html", html(whole).encode())
+    write_html(directory / "index.html", html(whole).encode())
     sweep(directory)
     return directory / "index.html"
 
