@@ -1,5 +1,6 @@
 """Habits of ordinary numpy code, in a defence: what is traced has the bits of the plain loop over a whole episode, and the rest is not traced."""
 
+import copy
 import functools
 import types
 from dataclasses import dataclass
@@ -283,3 +284,51 @@ def test_a_narrow_index_may_point_into_a_large_table():
             return num.take(np.linspace(1.0, 2.0, 200), state.small[:, 0])[:, None] + 0.0 * r[:, :, 0], state._replace(small=state.small + np.int8(1))
 
     assert _played(Table(), 60) == ""
+
+
+@dataclass(frozen=True)
+class Rings(Habit):
+    """A ring of narrow numbers keeps its type, a remainder its sign, and whole numbers of Python have no end."""
+
+    n: int = param(3_000_000, "number")
+
+    def more(self, state, r):
+        i = state.place - 100
+        score = (i % 7) + (i % np.where(i % 2 == 0, 3, -5)) + self.n * self.n * self.n * 1e-20
+        return score[:, None] + 0.0 * r[:, :, 0], state._replace(small=num.put(state.small, state.place % 3, state.place + 200), place=state.place + 1)
+
+
+@dataclass(frozen=True)
+class Aliases(Habit):
+    """Numbers cannot be written to, arrays can: in place, and where they are copied."""
+
+    p: float = param(0.5, "gain")
+
+    def more(self, state, r):
+        gain = self.p
+        gain += 1.0
+        z = np.where(np.abs(r) > 1e3, r, 0.0) + r
+        w = z
+        w **= 2
+        other = copy.deepcopy(z)
+        other[:, :, 0] = 7.0
+        return z[:, :, 0] * self.p + gain + np.isin(state.place, [3, 5])[:, None], state._replace(place=state.place + 1)
+
+
+@pytest.mark.parametrize("defence", [Rings(), Rings(5), Aliases(), Aliases(2.0)], ids=str)
+def test_more_habits_have_the_bits_of_numpy(defence):
+    assert _played(defence) == ""
+
+
+@pytest.mark.parametrize(("code", "why"), [
+    (lambda x: x[::-1], "another order"), (lambda x: x[:1] * 1.0, "some of the episodes"), (lambda x: x.reshape(len(x), -1, order="F"), "the order F"),
+    (lambda x: (x > 0) * 1 < 2**63, "use a number"),
+])  # fmt: skip
+def test_a_refusal_names_the_reason(code, why):
+    @dataclass(frozen=True)
+    class Odd(Habit):
+        def more(self, state, r):
+            code(r[:, :, 0])
+            return r[:, :, 0], state
+
+    assert why in commanded(load_scenario("braking-v0").loop(Odd())).why

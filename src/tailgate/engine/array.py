@@ -17,6 +17,7 @@ import numpy as np
 
 from tailgate.engine.buffers import blended, boxed, common_shape, swept, wide
 from tailgate.engine.graph import Graph, Node
+from tailgate.engine.indices import check_whole, known_index
 from tailgate.engine.operations import BOOL, Array, ArrayLike, Axis, DTypeLike, with_operators
 from tailgate.engine.untraceable import Untraceable
 
@@ -139,6 +140,8 @@ class Traced(_Base):
 
     def reshape(self, *shape: Any, order: str = "C") -> Traced:
         """Change the shape; the episodes' axis stays first or last."""
+        if order != "C":
+            raise Untraceable(f"a shape in the order {order}", "transpose first")
         new = tuple(shape[0]) if len(shape) == 1 and isinstance(shape[0], (tuple, list)) else shape
         nodes = self.nodes.reshape(new)
         if self.batch is None:
@@ -156,12 +159,20 @@ class Traced(_Base):
         """Copy the array."""
         return Traced(self.graph, self.nodes.copy(), self.dtype, self.batch, self.weak)
 
+    def __copy__(self) -> Traced:
+        return self.copy()
+
+    def __deepcopy__(self, memo: object) -> Traced:
+        return self.copy()
+
     def view(self, dtype: DTypeLike | None = None) -> Traced:
         """Return the same nodes; with another type of the same size, reinterpret their bits."""
         if dtype is None or np.dtype(dtype) == self.dtype:
             return Traced(self.graph, self.nodes, self.dtype, self.batch, self.weak, self.flags.writeable)
         to = np.dtype(dtype)
-        return self.mapped(lambda node: self.graph.bits(node, to), to)
+        out = self.mapped(lambda node: self.graph.bits(node, to), to)
+        out.flags.writeable = False  # numpy would write through
+        return out
 
     def astype(self, dtype: DTypeLike, order: str = "K", casting: str = "unsafe", copy: bool = True) -> Traced:
         """Convert to another type."""
@@ -170,6 +181,9 @@ class Traced(_Base):
             raise Untraceable(f"a float as {to}", "write x.astype(np.int64): numpy's answer to other types depends on the machine")
         if to == self.dtype:
             return self.copy() if copy else self
+        if self.dtype.kind == "f" and to.kind in "iu" and to != np.int64:  # as numpy does it here
+            with np.errstate(invalid="ignore"):
+                return lifted(self.graph, self.values().astype(to))
         return self.mapped(lambda node: self.graph.cast(node, to), to)
 
     def mapped(self, function: Callable[[Node], Node], dtype: DTypeLike | None = None) -> Traced:
@@ -180,10 +194,11 @@ class Traced(_Base):
 
     def _key(self, key: object) -> tuple[Any, ...]:
         """Return an index of numpy's without traced arrays."""
-        return tuple(_index(part) if isinstance(part, Traced) else part for part in (key if isinstance(key, tuple) else (key,)))
+        return tuple(known_index(part) if isinstance(part, Traced) else part for part in (key if isinstance(key, tuple) else (key,)))
 
     def __getitem__(self, key: object) -> Traced:
         plain = self._key(key)
+        check_whole(self, plain)
         return self._moved(lambda a: a[plain])
 
     def __setitem__(self, key: object, value: ArrayLike) -> None:
@@ -198,6 +213,7 @@ class Traced(_Base):
             self.batch = self.batch if self.batch is not None else mask.batch
             return
         plain, new = self._key(key), lifted(graph, value, self.dtype)
+        check_whole(self, plain)
         cast = new.astype(self.dtype, copy=False).nodes
         self.nodes[plain] = cast if cast.ndim else cast[()]
         if new.batch is not None and self.batch is None and self.shape[:1] == (1,):
@@ -239,6 +255,12 @@ class Traced(_Base):
         """Limit to [low, high]."""
         return np.minimum(np.maximum(self, low), high)
 
+    def __ipow__(self, exponent: float) -> Any:
+        if not self.ndim:
+            return self**exponent
+        self[...] = self**exponent
+        return self
+
     def __pow__(self, exponent: float) -> Array:
         """Raise to 0.5, 1 or 2; for other exponents numpy calls a library whose bits differ between machines."""
         known = float(exponent)
@@ -249,14 +271,6 @@ class Traced(_Base):
         kind = type(exponent) if type(exponent) in (int, float) else np.result_type(getattr(exponent, "weak", None) or exponent)
         base = self.astype(np.power.resolve_dtypes((self.dtype, kind, None))[0], copy=False)
         return {0.5: np.sqrt, 1.0: np.positive, 2.0: np.square}[known](base)
-
-
-def _index(part: Traced) -> Any:
-    """Return a part of an index without traced arrays; a number shows a view, as in numpy, and an array a copy."""
-    if part.dtype == BOOL:
-        return part.known("rows of a mask", "write np.where(mask, x, y) for all rows")
-    found = part.known("an index", "write num.take(x, index)")
-    return found if found.ndim else operator.index(found[()])
 
 
 def each(graph: Graph, function: Callable[..., Node], *arrays: Array) -> Array:
@@ -352,10 +366,11 @@ def summands(x: Traced, axis: Axis, dtype: DTypeLike | None = None) -> Traced:
     """Return x in the type of its sum; raise Untraceable if it is too long to sum in a fixed order."""
     axes = axes_of(x, axis, "name the axis")
     long = math.prod(x.shape[a] for a in axes)
-    if x.dtype.kind == "f" and (long > 7 or sum(x.shape[a] > 1 for a in axes) > 1):
+    to = np.dtype(dtype or WIDEST.get(x.dtype.kind, x.dtype))
+    if to.kind == "f" and (long > 7 or sum(x.shape[a] > 1 for a in axes) > 1):
         what = f"a sum of {long} numbers" if long > 7 else "a sum over several axes"
         raise Untraceable(what, "write num.dot, or a loop: numpy's order of them depends on their place in memory")
-    return typed(x.graph, x, np.dtype(dtype or WIDEST.get(x.dtype.kind, x.dtype)))
+    return typed(x.graph, x, to)
 
 
 def reduced(x: Traced, op: str, axis: Axis, keepdims: bool, instead: str = "name an axis that is not the episodes'") -> Traced:

@@ -121,8 +121,10 @@ def _count_nonzero(x: Traced, axis: Axis = None, keepdims: bool = False) -> Trac
 def _is_in(x: Traced, values: ArrayLike, invert: bool = False) -> Array:
     """Return where x equals one of a few whole numbers, such as enumerations."""
     found: Array = lifted(x.graph, np.zeros(x.shape, bool))
-    for value in np.asarray(values).ravel().tolist():
-        found = found | (x == value)
+    held = np.asarray(values)
+    to = np.result_type(x.dtype, held.dtype)
+    for value in held.ravel().astype(to):
+        found = found | (x.astype(to, copy=False) == value)
     return ~found if invert else found
 
 
@@ -135,7 +137,9 @@ def _untold(what: str, instead: str) -> Any:
 
 
 def _copyto(target: Traced, source: ArrayLike, casting: str = "same_kind", where: ArrayLike = True) -> None:
-    target[...] = source if where is True else chosen(where, source, target)
+    if not np.can_cast(getattr(source, "dtype", np.asarray(source).dtype), target.dtype, casting):  # type: ignore[arg-type]
+        raise TypeError(f"np.copyto cannot cast to {target.dtype} according to the rule {casting!r}")
+    target[...] = source if where is True else chosen(where, source, target, target.dtype)
 
 
 def _choose(conditions: Sequence[Array], choices: Sequence[ArrayLike], default: ArrayLike = 0) -> ArrayLike:
@@ -161,7 +165,7 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.moveaxis: lambda x, source, to: x._moved(lambda a: np.moveaxis(a, source, to)),
     np.expand_dims: lambda x, axis: x._moved(lambda a: np.expand_dims(a, axis)),
     np.squeeze: lambda x, axis: x.squeeze(axis),
-    np.reshape: lambda x, shape, order="C": x.reshape(shape),
+    np.reshape: lambda x, shape, order="C": x.reshape(shape, order=order),
     np.ravel: lambda x, order="C": x.ravel(),
     np.diagonal: lambda x, offset=0, axis1=0, axis2=1: x.diagonal(offset, axis1, axis2),
     np.tile: lambda x, reps: _untold("np.tile", "np.concatenate") if isinstance(reps, tuple) else _tiled(x, operator.index(reps)),

@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 
 from tailgate.base.errors import InputError
-from tailgate.engine.array import Traced
+from tailgate.engine.array import Traced, chosen, lifted
 from tailgate.engine.functions import gathered, picked
 from tailgate.engine.loops import chosen_apart
 from tailgate.engine.operations import Array, Mask
@@ -67,8 +67,8 @@ def pick(ring: Array, place: Array) -> Array:
 def put(ring: Array, place: Array, value: Array) -> Array:
     """Return the ring (B, ..., L) with `value` (B, ...) at `place`, from -L to L - 1, which broadcasts to (B, ...)."""
     if isinstance(ring, Traced):
-        place = _counted(place, ring.shape[-1])
-        return np.where(place[..., None] == np.arange(ring.shape[-1]), value[..., None], ring)
+        sent = lifted(ring.graph, value, ring.dtype).astype(ring.dtype, copy=False)
+        return chosen(_counted(place, ring.shape[-1])[..., None] == np.arange(ring.shape[-1]), sent[..., None], ring, ring.dtype)
     out = ring.copy(order="K")
     if ring.ndim == 2 and np.ndim(place) == 1:
         out[np.arange(len(ring)), place] = value

@@ -74,7 +74,7 @@ def with_operators(kind: type[T]) -> type[T]:
         return lambda self, other: ufunc(other, self)
 
     def in_place(ufunc: np.ufunc) -> Callable[[Any, Any], Any]:
-        return lambda self, other: ufunc(self, other, out=(self,))
+        return lambda self, other: ufunc(self, other, out=(self,)) if self.ndim else ufunc(self, other)  # a number cannot be written to
 
     for name, ufunc in pairs.items():
         setattr(kind, f"__{name}__", plain(ufunc))

@@ -30,6 +30,7 @@ from tailgate.engine.graph import Graph, Node, ordered
 from tailgate.engine.operations import FLOAT, Array
 
 T = TypeVar("T")
+SMALL = 2**15  # whole numbers of which a few may be multiplied without leaving 64 bits, as Python does; larger ones are constants
 MANY = 100  # numbers of a list that are compared by their bytes
 LARGE = 20_000  # numbers of an array that is used as it is, because code usually reads few of them
 _caches: weakref.WeakSet[Any] = weakref.WeakSet()  # of somebody's functions that traced code calls
@@ -174,7 +175,7 @@ class _Reader:
         self._known: dict[int, tuple[int, Any, Any]] = {}
 
     def visit(self, held: object) -> Any:
-        if type(held) is float or (type(held) is int and abs(held) < 2**62):
+        if type(held) is float or (type(held) is int and abs(held) < SMALL):
             leaf = np.array([held])
             (node,) = self._leaf(leaf)
             return held if self.graph is None else Traced(self.graph, boxed(node), leaf.dtype, None, type(held))

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from functools import update_wrapper
 from typing import Any, TypeVar, cast
 
-from tailgate.engine.array import Traced, each, lifted, shared_batch
+from tailgate.engine.array import Traced, each, lifted, shared_batch, typed
 from tailgate.engine.buffers import boxed
 from tailgate.engine.evaluation import evaluate
 from tailgate.engine.graph import Graph, Node
-from tailgate.engine.operations import ArrayLike
+from tailgate.engine.operations import FLOAT, ArrayLike
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -49,6 +49,7 @@ class _Called:
             return self.function(*args)
         graph = found.graph
         arrays = [lifted(graph, x, found.dtype) for x in args]
+        arrays = [typed(graph, x, FLOAT) if x.dtype.kind == "f" else x for x in arrays]  # as the plain functions compute
         routine, several = self._routine(tuple(x.dtype for x in arrays))
         back, out = shared_batch(arrays), []
         for i, result in enumerate(routine.outputs):

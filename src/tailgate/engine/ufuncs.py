@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -24,6 +25,7 @@ _SINGLES: dict[np.ufunc, str] = {
 }  # fmt: skip
 _LOGICAL = {np.logical_and, np.logical_or, np.logical_xor, np.logical_not}
 _ON_BOOLS = {"add": "or", "mul": "and", "min": "and", "max": "or"}
+_UNBOUNDED = {"add": operator.add, "sub": operator.sub, "mul": operator.mul, "shl": operator.lshift, "shr": operator.rshift}
 _LIBRARY = {
     np.exp: "num.exp",
     np.log: "num.log",
@@ -63,12 +65,17 @@ def _elementwise(graph: Graph, ufunc: np.ufunc, arrays: list[Traced], dtype: DTy
     if ufunc in _DERIVED:
         return _DERIVED[ufunc](*arrays)
     op = _PAIRS.get(ufunc) or _SINGLES.get(ufunc)
+    if op in _UNBOUNDED and all(a.weak in (int, bool) for a in arrays) and (op in ("shl", "shr") or any(_large(a) for a in arrays)):
+        return lifted(graph, _UNBOUNDED[op](*(a.values().item() for a in arrays)))  # Python's whole numbers have no end
     if op is None:
         raise Untraceable(f"np.{ufunc.__name__}", f"write {_LIBRARY.get(ufunc, 'it with +, -, *, /, np.sqrt, np.where')}")
     kinds = [BOOL] * len(arrays) if ufunc in _LOGICAL else loop_types(ufunc, arrays)
-    if dtype is not None:
+    if dtype is not None and op in COMPARISONS:
+        if np.dtype(dtype) != BOOL:
+            raise Untraceable(f"np.{ufunc.__name__} with dtype={np.dtype(dtype)}", "compare without it")
+    elif dtype is not None:
         kinds = [np.dtype(dtype)] * len(arrays)
-    elif len(arrays) > 1 and ufunc not in _LOGICAL and kinds[0].kind in "iu" and kinds[0] != np.int64:
+    elif len(arrays) > 1 and ufunc not in _LOGICAL and kinds[0].kind in "iu":
         kinds = [_exact(ufunc, op, arrays, kinds[0])] * len(arrays)
     if any(kind.kind not in "fiub" for kind in kinds):
         raise Untraceable(f"np.{ufunc.__name__} of {', '.join(map(str, kinds))}", "use real numbers")
@@ -82,13 +89,20 @@ def _elementwise(graph: Graph, ufunc: np.ufunc, arrays: list[Traced], dtype: DTy
     return elementwise(graph, lambda x, y: graph.binary(op, x, y), arrays, BOOL if op in COMPARISONS else kinds[0])
 
 
+def _large(x: Traced) -> bool:
+    return all(node.op == "const" for node in x.nodes.flat) and abs(int(x.nodes.item().attr)) >= 2**15
+
+
 def _exact(ufunc: np.ufunc, op: str, arrays: Sequence[Traced], kind: np.dtype[Any]) -> np.dtype[Any]:
     """Return the type in which narrow whole numbers meet Python's: numpy compares them as they are, and computes with no others."""
     limits = np.iinfo(kind)
-    wrong = [a for a in arrays if a.weak is int and not limits.min <= a.values().item() <= limits.max]
+    asked = [a for a in arrays if a.weak is int and (kind.itemsize < 8 or all(node.op == "const" for node in a.nodes.flat))]
+    wrong = [a for a in asked if not limits.min <= a.values().item() <= limits.max]  # a parameter is small, as `lifted` has it
     if not wrong:
         return kind
-    if op not in COMPARISONS or kind == np.uint64:
+    if op in COMPARISONS and kind.itemsize == 8:
+        raise Untraceable(f"a comparison of {kind} with {wrong[0].values().item()}", "use a number that the type holds")
+    if op not in COMPARISONS:
         raise OverflowError(f"Python integer {wrong[0].values().item()} out of bounds for {kind}, in np.{ufunc.__name__}")
     return np.dtype(np.int64)
 
@@ -118,12 +132,15 @@ def _by_a_constant(graph: Graph, op: str, arrays: list[Traced], dtype: np.dtype[
 
 def _remainder(x: Traced, y: Traced) -> Array:
     """Return the remainder of whole numbers with the sign of y, and 0 where y is 0."""
-    graph = x.graph
-    back = y < 0
-    size = np.where(back, -y, y) if y.dtype.kind == "i" else y
-    parts: list[Any] = [np.where(back, -x, x), np.where(size == 0, 1, size)]
-    rest = elementwise(graph, lambda p, q: graph.binary("rem", p, q), parts, x.dtype)
-    return np.where(y == 0, 0, np.where(back, -rest, rest) if y.dtype.kind == "i" else rest)
+    graph, signed = x.graph, y.dtype.kind == "i"
+    size = np.where(y < 0, -y, y) if signed else y
+    least = np.iinfo(y.dtype).min  # which has no opposite
+    parts: list[Any] = [x, np.where((size == 0) | (size == least) if signed else size == 0, 1, size)]
+    rest: Array = elementwise(graph, lambda p, q: graph.binary("rem", p, q), parts, x.dtype)
+    if signed:
+        rest = np.where((y < 0) & (rest != 0), rest + y, rest)
+        rest = np.where(y == least, np.where(x > 0, x + y, np.where(x == y, 0, x)), rest)
+    return np.where(y == 0, 0, rest)
 
 
 def _divided(graph: Graph, op: str, x: Node, y: Node) -> Node:
