@@ -75,7 +75,8 @@ class Remembered(Generic[T]):
             key = None if parameters.key is None else (form, parameters.key)
             if found := self._find(key, parameters):
                 return adopt(found, parameters.values)
-            play()
+            with np.errstate(all="ignore"):
+                play()
             first = Parameters(held).snapshot()
             with parameters.restored():
                 made = make()
