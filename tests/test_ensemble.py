@@ -322,6 +322,13 @@ def test_an_error_of_the_defence_ends_its_search(monkeypatch, tmp_path):
         starts_of(nothing, "black", [], 0)
 
 
+def test_a_defence_without_a_look_has_no_white_box(monkeypatch):
+    """The attack finds that out when it plays; the search goes on."""
+    place = dataclasses.replace(arena("car"), defence="brake_kf")
+    monkeypatch.setattr(type(place.loop.defence), "look", property(), raising=False)
+    assert place.promising(["stealth", "fdi:value=3"]) == ["fdi:value=3"]
+
+
 def test_computed_optima_are_no_members(monkeypatch):
     """They count for no rank, and would take the place of the best white box that does."""
     place, asked = arena("car"), []

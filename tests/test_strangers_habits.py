@@ -237,7 +237,7 @@ TABLE: dict[int, np.ndarray] = {}
 
 
 class Remembers(Habit):
-    """Constants in a mapping of its own, in one of its module, and in its class; and a sum that is not traced."""
+    """It keeps constants in its mapping, in a mapping of its module, and in its class. Its sum is not traced."""
 
     w = None
 

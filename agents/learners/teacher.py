@@ -125,7 +125,8 @@ def _played(seat: Seat, attack: Attack, plan: object, keys: Keys) -> dict[str, A
     """Return the results (K, B, ...) of all decisions, by a traced program where it pays: decisions of many steps take long to compile."""
     if seat.action.spec.interval == 1 and worth_tracing(seat.loop, len(keys.key)):
         made = _made.proved(
-            (seat, attack, plan), lambda: decided(seat, attack, plan, begun(seat, attack, plan, _ONE)), lambda: None,
+            (seat, attack, plan), lambda: decided(seat, attack, plan, begun(seat, attack, plan, _ONE)),
+            lambda: None,  # the line above has played a step
             lambda: Showing(seat, attack, plan),
             lambda found, values: found.of(seat, attack, plan, values), _difference,
         )  # fmt: skip

@@ -14,6 +14,7 @@ from pathlib import Path
 
 _wanted = False
 _INSTALLED = {"site-packages", "dist-packages"}
+_PACKAGE = Path(__file__).parents[1]  # rows record its version
 
 
 def allow() -> None:
@@ -59,11 +60,11 @@ def _imported(file: Path, changed: int) -> list[tuple[int, str]]:
     return list(dict.fromkeys(out))
 
 
-def _found(level: int, name: str, beside: Path) -> Path | None:
-    """Return the file of a module of somebody's, whether or not it is loaded; None for what is installed, or no module."""
+def _found(level: int, name: str, reader: Path) -> Path | None:
+    """Return the file of a module that the file `reader` imports, loaded or not; None for what is installed, or no module."""
     if not level and name.partition(".")[0] in {"tailgate", *sys.stdlib_module_names}:
         return None
-    above = str(beside.parents[level - 1]) if level else str(beside.parent)
+    above = str(reader.parents[level - 1]) if level else str(reader.parent)
     places: list[str] | None = [above] if level else [*sys.path, *folders(), above]
     for part in name.split("."):
         spec = PathFinder.find_spec(part, places)
@@ -80,7 +81,7 @@ def files_of(value: object) -> list[Path]:
     own = [getattr(sys.modules.get(name), "__file__", None) for i, name in enumerate(bases) if i == 0 or editable(name)]
     found = [file for file in map(Path, filter(None, own)) if file.is_file()]
     for file in found:  # which grows
-        if not _INSTALLED & set(file.parts):
+        if not _INSTALLED & set(file.parts) and _PACKAGE not in file.parents:
             more = (_found(level, name, file) for level, name in _imported(file, file.stat().st_mtime_ns))
             found += [one for one in dict.fromkeys(more) if one is not None and one not in found]
     return list(dict.fromkeys(found[:1] + sorted(found[1:])))

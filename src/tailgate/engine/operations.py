@@ -14,6 +14,7 @@ T = TypeVar("T")
 Axis = int | Sequence[int] | None
 Shape = int | Sequence[int]
 Mask = Array | np.bool_  # numpy's reductions return either
+SMALL = 2**15  # whole numbers below are parameters: products of a few stay within 64 bits, and Python's have no end
 BOOL, FLOAT, INT = np.dtype(bool), np.dtype(np.float64), np.dtype(np.int64)
 DTYPES = [np.dtype(name) for name in ("?", "f8", "f4", "i8", "u8", "i4", "u4", "i2", "u2", "i1", "u1")]
 

@@ -27,10 +27,9 @@ from tailgate.base.sources import own
 from tailgate.engine.array import Traced
 from tailgate.engine.buffers import boxed
 from tailgate.engine.graph import Graph, Node, ordered
-from tailgate.engine.operations import FLOAT, Array
+from tailgate.engine.operations import FLOAT, SMALL, Array
 
 T = TypeVar("T")
-SMALL = 2**15  # whole numbers of which a few may be multiplied without leaving 64 bits, as Python does; larger ones are constants
 MANY = 100  # numbers of a list that are compared by their bytes
 LARGE = 20_000  # numbers of an array that is used as it is, because code usually reads few of them
 _caches: weakref.WeakSet[Any] = weakref.WeakSet()  # of somebody's functions that traced code calls

@@ -10,7 +10,7 @@ import numpy as np
 
 from tailgate.engine.array import WIDEST, Traced, each, elementwise, lifted, reduced, summands, typed
 from tailgate.engine.graph import Graph, Node
-from tailgate.engine.operations import BOOL, COMPARISONS, Array, ArrayLike, DTypeLike
+from tailgate.engine.operations import BOOL, COMPARISONS, SMALL, Array, ArrayLike, DTypeLike
 from tailgate.engine.untraceable import Untraceable
 
 _PAIRS: dict[np.ufunc, str] = {
@@ -90,14 +90,15 @@ def _elementwise(graph: Graph, ufunc: np.ufunc, arrays: list[Traced], dtype: DTy
 
 
 def _large(x: Traced) -> bool:
-    return all(node.op == "const" for node in x.nodes.flat) and abs(int(x.nodes.item().attr)) >= 2**15
+    """Return True for a whole number of Python in the code, and no parameter, of which few products leave 64 bits."""
+    return x.size == 1 and x.nodes.item().op == "const" and abs(int(x.nodes.item().attr)) >= SMALL
 
 
 def _exact(ufunc: np.ufunc, op: str, arrays: Sequence[Traced], kind: np.dtype[Any]) -> np.dtype[Any]:
     """Return the type in which narrow whole numbers meet Python's: numpy compares them as they are, and computes with no others."""
     limits = np.iinfo(kind)
-    asked = [a for a in arrays if a.weak is int and (kind.itemsize < 8 or all(node.op == "const" for node in a.nodes.flat))]
-    wrong = [a for a in asked if not limits.min <= a.values().item() <= limits.max]  # a parameter is small, as `lifted` has it
+    asked = [a for a in arrays if a.weak is int and a.size == 1 and (kind.itemsize < 8 or a.nodes.item().op == "const")]
+    wrong = [a for a in asked if not limits.min <= a.values().item() <= limits.max]  # a parameter is small (SMALL)
     if not wrong:
         return kind
     if op in COMPARISONS and kind.itemsize == 8:
@@ -204,7 +205,7 @@ def _copied_sign(x: Traced, y: Traced) -> Array:
 _DERIVED: dict[np.ufunc, Callable[..., Array]] = {
     np.square: lambda x: x * x,
     np.positive: lambda x: x.copy(),
-    np.reciprocal: lambda x: _reciprocal(x),
+    np.reciprocal: _reciprocal,
     np.isfinite: lambda x: np.absolute(x) < np.inf,
     np.isnan: lambda x: x != x,
     np.isinf: lambda x: np.absolute(x) == np.inf,

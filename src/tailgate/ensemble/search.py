@@ -245,7 +245,11 @@ class Arena:
                 attack.prepare(self.seat(spec.entry.knowledge, attack).brief)
             except NotApplicable:
                 continue
-            tried[text] = self.confirmed(text, "select", 0, min(TRIED, FINAL))[1]  # an error of the defence is none of the attack
+            try:
+                tried[text] = self.confirmed(text, "select", 0, min(TRIED, FINAL))[1]
+            except NotApplicable as error:  # some attacks find out only when they look at the defence; its own errors end the search
+                if not error.field.startswith("attack "):
+                    raise
         return sorted(tried, key=lambda one: -tried[one])[:count]
 
     def best(self, texts: Iterable[str]) -> list[Found]:
