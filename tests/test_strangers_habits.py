@@ -332,3 +332,22 @@ def test_a_refusal_names_the_reason(code, why):
             return r[:, :, 0], state
 
     assert why in commanded(load_scenario("braking-v0").loop(Odd())).why
+
+
+@dataclass(frozen=True)
+class Prepared(Habit):
+    """It caches numbers that only a step asks for."""
+
+    gain: float = param(2.0, "gain")
+
+    @functools.cached_property
+    def table(self):
+        return np.arange(3.0) * self.gain
+
+    def more(self, state, r):
+        return r[:, :, 0] * self.table[1], state
+
+
+def test_an_equal_object_that_has_cached_nothing_yet_finds_the_program():
+    for gain in (2.0, 2.0, 3.0):
+        assert _played(Prepared(gain), 40) == ""
