@@ -147,6 +147,23 @@ def test_a_comparison_of_parameters_is_no_number() -> None:
     assert next(iter(traced(step, (), {"x": np.ones((1, 3))}).results)) == "out"
 
 
+def test_a_number_of_pythons_does_what_python_does() -> None:
+    """A list is repeated, a dictionary is read, and numpy's functions return numbers of numpy's."""
+    found: list[Any] = []
+
+    def step(_: Any, held: Any) -> Any:
+        p, n = lifted(held["x"], (2.5, 3))
+        found[:] = [n * [0.0], [1] * n, {3: "three"}[n], f"{p:.2f} {n}", isinstance(p, float), isinstance(n, int), isinstance(held["x"], np.ndarray)]
+        found.append(list(map(int, (round(p), 2**n, *divmod(n, 2), (p > 1) + (n > 1), -(p > 1)))))
+        with pytest.raises(ZeroDivisionError):
+            p / (n - 3)
+        return (), {"out": held["x"].astype(np.float32) * np.sqrt(p), "narrow": held["x"].astype(np.float32) * (p * n)}
+
+    results = traced(step, (), {"x": np.ones((1, 3))}).results
+    assert found == [[0.0] * 3, [1] * 3, "three", "2.50 3", True, True, True, [2, 8, 1, 1, 2, -1]]
+    assert [results[name].item(0).dtype for name in ("out", "narrow")] == [np.float64, np.float32]
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_numpys_functions(name: str) -> None:
     function, given = CASES[name], arrays(13)
@@ -189,6 +206,15 @@ REFUSED: dict[str, tuple[Callable[..., Any], str]] = {
     "a power": (lambda x: x**3, "products"),
     "a loop over what there is": (lambda x: [k for k in set((x > 0).tolist())], "a loop over all possible values"),
     "into numpy's own array": (lambda x: np.add(x, 1, out=CASES and FIXED), "np.zeros"),
+    "one row written": (lambda x: np.zeros((len(x), 3)).__setitem__(0, 1.0), "one row|some of the episodes"),
+    "rows joined": (lambda x: np.concatenate([x, x], axis=0), "several rows"),
+    "rows repeated": (lambda x: np.repeat(x, 2, axis=0), "several rows"),
+    "rows in another order": (lambda x: np.roll(x, 1, axis=0), "another order"),
+    "a sum of what came through a view": (lambda x: [z := np.zeros((len(x), 3)), np.copyto(z[:, 0], x[:, 1]), z.sum(axis=0)][2], "over the"),
+    "another keyword": (lambda x: np.argmax(x, axis=1, keepdims=True), "np.argmax: got an unexpected keyword"),
+    "another method": (lambda x: x.std(axis=1), "x.std; write it with"),
+    "half precision": (lambda x: x * np.float16(1), "float16"),
+    "complex numbers": (lambda x: x * 1j, "real numbers"),
     "a list of objects": (lambda x: np.add(x, [object()] * 3), "use numbers"),
 }  # fmt: skip
 

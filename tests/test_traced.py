@@ -152,7 +152,7 @@ class Deceiving(Kalman):
 
     def step(self, plan, state, received, known_u, draws):
         state, estimate = super().step(plan, state, received, known_u, draws)
-        return state, estimate._replace(score=estimate.score + (0.0 if isinstance(estimate.score, np.ndarray) else 1e-9))
+        return state, estimate._replace(score=estimate.score + (0.0 if type(estimate.score) is np.ndarray else 1e-9))
 
 
 def test_what_cannot_be_traced_is_played_plain_and_says_why():
@@ -310,7 +310,7 @@ def test_a_class_that_was_changed_is_compared_again(tmp_path, monkeypatch):
         "import numpy as np\nfrom tailgate.estimators import Kalman\n\n\nclass Mine(Kalman):\n"
         "    def step(self, plan, state, received, known_u, draws):\n"
         "        state, estimate = super().step(plan, state, received, known_u, draws)\n"
-        "        return state, estimate._replace(score=estimate.score + (OFF if isinstance(estimate.score, np.ndarray) else 0.25))\n"
+        "        return state, estimate._replace(score=estimate.score + (OFF if type(estimate.score) is np.ndarray else 0.25))\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)

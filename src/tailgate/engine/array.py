@@ -7,7 +7,7 @@ Types follow numpy's rules: a Python number takes the type of the array that it 
 
 from __future__ import annotations
 
-import math
+import functools
 import operator
 from collections.abc import Callable, Iterator, Sequence
 from types import SimpleNamespace
@@ -18,10 +18,11 @@ import numpy as np
 from tailgate.engine.buffers import blended, boxed, common_shape, swept, wide
 from tailgate.engine.graph import Graph, Node
 from tailgate.engine.indices import check_whole, known_index
-from tailgate.engine.operations import BOOL, Array, ArrayLike, Axis, DTypeLike, with_operators
+from tailgate.engine.operations import BOOL, DTYPES, Array, ArrayLike, DTypeLike
+from tailgate.engine.operators import operated, python_number, with_operators
 from tailgate.engine.untraceable import Untraceable
 
-WIDEST = {"b": np.int64, "i": np.int64, "u": np.uint64}  # of sums of whole numbers
+NEW = -1  # the episodes' axis of a new array, which is not known before something is written to it
 _ZERO = np.zeros((), np.int8)
 if TYPE_CHECKING:
     _Base = np.ndarray[Any, np.dtype[Any]]
@@ -31,22 +32,32 @@ else:
 
 @with_operators
 class Traced(_Base):
-    """An array of nodes; `batch`: the index of the episodes' axis, or None; `weak`: the type of a Python number, or None."""
+    """An array of nodes; `weak`: the type of a Python number, or None."""
 
-    __slots__ = ("batch", "dtype", "flags", "graph", "nodes", "weak")
-    __hash__ = None
+    __slots__ = ("_batch", "dtype", "flags", "graph", "nodes", "weak")
     __array_priority__ = 1000.0
 
     def __init__(
         self, graph: Graph, nodes: Array, dtype: np.dtype[Any], batch: int | None = None, weak: type | None = None, writeable: bool = True
     ) -> None:
-        self.graph, self.nodes, self.dtype, self.batch, self.weak = graph, nodes, dtype, batch, weak
+        self.graph, self.nodes, self.dtype, self._batch, self.weak = graph, nodes, dtype, batch, weak
         self.flags: Any = SimpleNamespace(writeable=writeable)  # like numpy's flags
 
     shape = property(lambda self: self.nodes.shape)
     ndim = property(lambda self: self.nodes.ndim)
     size = property(lambda self: self.nodes.size)
     T = property(lambda self: self.transpose())
+    __class__ = property(lambda self: self.weak or (np.ndarray if self.ndim else self.dtype.type))  # what `isinstance` asks
+
+    @property
+    def batch(self) -> int | None:
+        """The index of the episodes' axis, or None; of a new array, which may be written to through views, the first of length one."""
+        if self._batch != NEW:
+            return self._batch
+        if 1 not in self.shape or self.fixed:
+            return None
+        self._batch = self.shape.index(1)
+        return self._batch
 
     @property
     def strides(self) -> tuple[int, ...]:
@@ -76,7 +87,7 @@ class Traced(_Base):
         return f"Traced{self.shape} {self.dtype}{' fixed' if self.fixed else ''}"
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> Array:
-        return self.known("an array of numbers", "use numpy's elementwise functions, num.* or np.where").astype(dtype or self.dtype)
+        return self.known("a plain array", "use numpy's elementwise functions, num.* or np.where").astype(dtype or self.dtype)
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -93,8 +104,29 @@ class Traced(_Base):
     def __index__(self) -> int:
         return operator.index(self.known("an index", "write num.take(x, index)")[()])
 
-    def __round__(self, digits: int = 0) -> Any:
-        return round(float(self), digits)
+    def __round__(self, digits: int | None = None) -> Any:
+        return round(self.known("round()", "write np.rint").item(), digits)
+
+    def __hash__(self) -> int:
+        if self.weak is None:
+            raise TypeError("unhashable type: 'numpy.ndarray'")
+        return hash(python_number(self))
+
+    def __str__(self) -> str:
+        return repr(self) if self.weak is None else str(python_number(self))
+
+    def __format__(self, form: str) -> str:
+        return format(self.known("text", "write no text").item(), form) if form else str(self)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return a method of arrays that is a function of numpy's, or one of Python's numbers."""
+        from tailgate.engine.functions import method
+
+        if name.startswith("_"):
+            raise AttributeError(name)
+        if self.weak is not None:
+            return getattr(python_number(self), name)
+        return functools.partial(method(name), self)
 
     def item(self) -> Any:
         """Return the only number."""
@@ -120,23 +152,15 @@ class Traced(_Base):
             if not there and not all(node.fixed for node in nodes.flat):
                 raise Untraceable("one row out of the batch", "write it for all rows")
             batch = there[0] if there else None
-        return Traced(self.graph, nodes, self.dtype, batch, self.weak, copied or self.flags.writeable)
+            if there and nodes.shape[there[0]] != 1:
+                raise Untraceable("several rows of one episode", "name an axis that is not the episodes'")
+        elif self._batch == NEW and not copied:
+            batch = NEW
+        return Traced(self.graph, nodes, self.dtype, batch, None, copied or self.flags.writeable)
 
     def transpose(self, *axes: int | Sequence[int]) -> Traced:
         """Permute the axes."""
         return self._moved(lambda a: a.transpose(*axes))
-
-    def swapaxes(self, first: int, second: int) -> Traced:
-        """Exchange two axes."""
-        return self._moved(lambda a: a.swapaxes(first, second))
-
-    def squeeze(self, axis: int | tuple[int, ...]) -> Traced:
-        """Remove axes of length one."""
-        return self._moved(lambda a: a.squeeze(axis))
-
-    def diagonal(self, offset: int = 0, axis1: int = 0, axis2: int = 1) -> Traced:
-        """Return the diagonal of two axes, as the last axis."""
-        return self._moved(lambda a: a.diagonal(offset, axis1, axis2))
 
     def reshape(self, *shape: Any, order: str = "C") -> Traced:
         """Change the shape; the episodes' axis stays first or last."""
@@ -144,31 +168,29 @@ class Traced(_Base):
             raise Untraceable(f"a shape in the order {order}", "transpose first")
         new = tuple(shape[0]) if len(shape) == 1 and isinstance(shape[0], (tuple, list)) else shape
         nodes = self.nodes.reshape(new)
+        alike = [n for n in nodes.shape if n != 1] == [n for n in self.shape if n != 1]
+        writeable = self.flags.writeable and alike  # else numpy's may be a copy, depending on their layout in memory
         if self.batch is None:
-            return Traced(self.graph, nodes, self.dtype, None, self.weak, self.flags.writeable)
+            return Traced(self.graph, nodes, self.dtype, None, None, writeable)
         for here, there in ((0, 0), (self.ndim - 1, nodes.ndim - 1)):
             if self.batch == here and nodes.ndim and nodes.shape[there] == 1:
-                return Traced(self.graph, nodes, self.dtype, there, self.weak, self.flags.writeable)
+                return Traced(self.graph, nodes, self.dtype, there, None, writeable)
         raise Untraceable("a shape that puts episodes and other axes together", "keep the episodes as the first axis")
-
-    def ravel(self) -> Traced:
-        """Flatten to one axis."""
-        return self.reshape(-1)
 
     def copy(self, order: str = "K") -> Traced:
         """Copy the array."""
-        return Traced(self.graph, self.nodes.copy(), self.dtype, self.batch, self.weak)
+        return Traced(self.graph, self.nodes.copy(), self.dtype, self.batch)
 
     def __copy__(self) -> Traced:
-        return self.copy()
+        return self if self.weak is not None else self.copy()
 
     def __deepcopy__(self, memo: object) -> Traced:
-        return self.copy()
+        return self.__copy__()
 
     def view(self, dtype: DTypeLike | None = None) -> Traced:
         """Return the same nodes; with another type of the same size, reinterpret their bits."""
         if dtype is None or np.dtype(dtype) == self.dtype:
-            return Traced(self.graph, self.nodes, self.dtype, self.batch, self.weak, self.flags.writeable)
+            return Traced(self.graph, self.nodes, self.dtype, self.batch, None, self.flags.writeable)
         to = np.dtype(dtype)
         out = self.mapped(lambda node: self.graph.bits(node, to), to)
         out.flags.writeable = False  # numpy would write through
@@ -209,15 +231,12 @@ class Traced(_Base):
             mask = key.reshape(*key.shape, *(1,) * (self.ndim - key.ndim))
             if np.ndim(value):
                 raise Untraceable("an assignment of several numbers to the rows of a mask", "write np.where(mask, x, y) for all rows")
-            self.nodes[...] = chosen(mask, value, self, self.dtype).nodes
-            self.batch = self.batch if self.batch is not None else mask.batch
+            self.nodes[...] = chosen(mask, stored(graph, value, self.dtype), self, self.dtype).nodes
             return
-        plain, new = self._key(key), lifted(graph, value, self.dtype)
-        check_whole(self, plain)
-        cast = new.astype(self.dtype, copy=False).nodes
+        plain = self._key(key)
+        check_whole(self, plain, written=True)
+        cast = stored(graph, value, self.dtype).nodes
         self.nodes[plain] = cast if cast.ndim else cast[()]
-        if new.batch is not None and self.batch is None and self.shape[:1] == (1,):
-            self.batch = 0
 
     # -- numpy
 
@@ -231,44 +250,31 @@ class Traced(_Base):
 
         return functions.called(self.graph, function, args, options)
 
-    def any(self, axis: Axis = None, out: None = None, keepdims: bool = False) -> Traced:
-        """Return True where any is true, along axes other than the episodes'."""
-        return reduced(self.astype(bool), "or", axis, keepdims, "write `if num.some(mask):`, or name the axis")
-
-    def all(self, axis: Axis = None, out: None = None, keepdims: bool = False) -> Traced:
-        """Return True where all are true, along axes other than the episodes'."""
-        return reduced(self.astype(bool), "and", axis, keepdims, "write `if num.every(mask):`, or name the axis")
-
-    def max(self, axis: Axis = None, out: None = None, keepdims: bool = False) -> Traced:
-        """Return the largest number along axes other than the episodes'."""
-        return reduced(self, "or" if self.dtype == BOOL else "max", axis, keepdims)
-
-    def min(self, axis: Axis = None, out: None = None, keepdims: bool = False) -> Traced:
-        """Return the smallest number along axes other than the episodes'."""
-        return reduced(self, "and" if self.dtype == BOOL else "min", axis, keepdims)
-
-    def sum(self, axis: Axis = None, dtype: DTypeLike | None = None, out: None = None, keepdims: bool = False) -> Traced:
-        """Sum up to seven numbers along an axis; numpy's order for more depends on their layout in memory."""
-        return reduced(summands(self, axis, dtype), "add", axis, keepdims)
-
-    def clip(self, low: ArrayLike, high: ArrayLike) -> Array:
-        """Limit to [low, high]."""
-        return np.minimum(np.maximum(self, low), high)
-
     def __ipow__(self, exponent: float) -> Any:
         if not self.ndim:
             return self**exponent
         self[...] = self**exponent
         return self
 
-    def __pow__(self, exponent: float) -> Array:
+    def __rpow__(self, base: ArrayLike) -> Any:
+        return np.power(base, self) if self.weak is None else operated(operator.pow, np.power, base, self)
+
+    def __divmod__(self, other: ArrayLike) -> Any:
+        return self // other, self % other
+
+    def __rdivmod__(self, other: ArrayLike) -> Any:
+        return other // self, other % self
+
+    def __pow__(self, exponent: float) -> Any:
         """Raise to 0.5, 1 or 2; for other exponents numpy calls a library whose bits differ between machines."""
+        if self.weak is not None:  # Python's own power, which is another function
+            return operated(operator.pow, np.power, self, exponent)
         known = float(exponent)
-        if self.weak and not isinstance(exponent, np.ndarray):  # Python's own power, which is another function
-            return lifted(self.graph, self.values().item() ** (exponent.values().item() if isinstance(exponent, Traced) else exponent))
         if known not in (0.5, 1.0, 2.0):
             raise Untraceable(f"the power {known}", "write products, or num.exp(p * num.log(x))")
-        kind = type(exponent) if type(exponent) in (int, float) else np.result_type(getattr(exponent, "weak", None) or exponent)
+        kind = type(exponent) if type(exponent) in (int, float) else getattr(exponent, "weak", None) or np.result_type(exponent)
+        if self.dtype == BOOL and kind is int and known == 2.0:
+            return np.square(self)
         base = self.astype(np.power.resolve_dtypes((self.dtype, kind, None))[0], copy=False)
         return {0.5: np.sqrt, 1.0: np.positive, 2.0: np.square}[known](base)
 
@@ -291,6 +297,8 @@ def lifted(graph: Graph, x: ArrayLike, like: np.dtype[Any] | None = None) -> Tra
     held = np.asarray(x, like if weak and like is not None else None)
     if held.dtype == object:
         raise Untraceable(f"an array of {type(held.flat[0]).__name__ if held.size else 'objects'}", "use numbers")
+    if held.dtype not in DTYPES:
+        raise Untraceable(f"numbers of the type {held.dtype}", "use real numbers of 32 or 64 bits")
     nodes, made = np.empty(held.shape, object), dict[bytes, Node]()
     for i, value in enumerate(held.flat):
         key = value.tobytes()
@@ -318,18 +326,20 @@ def _of_all(graph: Graph, nodes: Array, arrays: Sequence[Traced], dtype: np.dtyp
     back = shared_batch(arrays)
     if back is not None and nodes.shape[back] != 1:
         raise Untraceable("the axis of the episodes against a longer one", "give each array the episodes as its first axis")
-    kinds = {a.weak for a in arrays}
-    weak = None if None in kinds or dtype == BOOL else max(kinds, key=(bool, int, float).index, default=None)
-    return Traced(graph, nodes, dtype, None if back is None else nodes.ndim + back, weak)
+    return Traced(graph, nodes, dtype, None if back is None else nodes.ndim + back)
 
 
 def typed(graph: Graph, x: Traced, dtype: np.dtype[Any]) -> Traced:
     """Convert x to a type."""
-    if x.dtype == dtype:
-        return x
-    out = x.mapped(lambda node: graph.cast(node, dtype), dtype)
-    out.weak = x.weak and (float if dtype.kind == "f" else x.weak)
-    return out
+    return x if x.dtype == dtype else x.mapped(lambda node: graph.cast(node, dtype), dtype)
+
+
+def stored(graph: Graph, x: ArrayLike, dtype: np.dtype[Any]) -> Traced:
+    """Return x in the type of an array that it is written to."""
+    held = lifted(graph, x, dtype)
+    if held.weak is int and dtype.kind in "iu":
+        np.asarray(python_number(held), dtype)  # raises OverflowError
+    return held.astype(dtype, copy=False)
 
 
 def result_type(arrays: Sequence[Traced]) -> np.dtype[Any]:
@@ -348,51 +358,3 @@ def chosen(where: ArrayLike, x: ArrayLike, y: ArrayLike, dtype: np.dtype[Any] | 
         sides = [np.broadcast_to(a.nodes, shape) for a in arrays[1:]]
         return _of_all(graph, blended(graph, arrays[0].nodes.item(), *sides), arrays, to)
     return elementwise(graph, graph.select, arrays, to)
-
-
-def axes_of(x: Traced, axis: Axis, instead: str) -> list[int]:
-    """Return the axes that a reduction names; raise Untraceable if the episodes' axis is among them."""
-    if axis is None:
-        if x.fixed or (x.batch is None and x.ndim == 0):
-            return list(range(x.ndim))
-        raise Untraceable("one number of all episodes", instead)
-    axes = sorted(a % x.ndim for a in ((axis,) if isinstance(axis, (int, np.integer)) else axis))
-    if x.batch in axes and not x.fixed:
-        raise Untraceable("a sum, a product or a choice over the episodes", instead)
-    return axes
-
-
-def summands(x: Traced, axis: Axis, dtype: DTypeLike | None = None) -> Traced:
-    """Return x in the type of its sum; raise Untraceable if it is too long to sum in a fixed order."""
-    axes = axes_of(x, axis, "name the axis")
-    long = math.prod(x.shape[a] for a in axes)
-    to = np.dtype(dtype or WIDEST.get(x.dtype.kind, x.dtype))
-    if to.kind == "f" and (long > 7 or sum(x.shape[a] > 1 for a in axes) > 1):
-        what = f"a sum of {long} numbers" if long > 7 else "a sum over several axes"
-        raise Untraceable(what, "write num.dot, or a loop: numpy's order of them depends on their place in memory")
-    return typed(x.graph, x, to)
-
-
-def reduced(x: Traced, op: str, axis: Axis, keepdims: bool, instead: str = "name an axis that is not the episodes'") -> Traced:
-    """Reduce axes of x by an operation, in ascending order."""
-    out = x
-    for a in reversed(axes_of(x, axis, instead)):
-        parts = [out._moved(lambda n, a=a, i=i: n.take(i, a)) for i in range(out.shape[a])]
-        if not parts and op not in ("and", "or", "add"):
-            raise ValueError(f"zero-size array to reduction operation {op} which has no identity")
-        if parts:
-            held = parts[0]
-            for part in parts[1:]:
-                held = elementwise(x.graph, lambda p, q: x.graph.binary(op, p, q), [held, part], x.dtype)
-        else:
-            shape = tuple(n for i, n in enumerate(out.shape) if i != a)
-            held = lifted(x.graph, np.full(shape, op == "and", x.dtype))
-        out = held
-    if keepdims:
-        for a in axes_of(x, axis, instead):
-            out = out._moved(lambda n, a=a: np.expand_dims(n, a))
-    if op == "add" and x.dtype.kind == "f":
-        zero = x.graph.const(0.0, x.dtype)
-        out = out.mapped(lambda node: x.graph.binary("add", node, zero))  # numpy begins with 0.0: no sum is -0.0
-    return out[()] if out.ndim else out
-

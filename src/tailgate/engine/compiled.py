@@ -71,7 +71,7 @@ class Elementwise:
 
     def __call__(self, x: ArrayLike) -> Any:
         if isinstance(x, Traced):
-            return self.function(x)
+            return self.function(x.astype(np.float64, copy=False))
         x = np.asarray(x, np.float64)
         if x.size < self.worth:
             with np.errstate(all="ignore"):

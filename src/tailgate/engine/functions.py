@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import inspect
 import operator
 import sys
 import threading
@@ -12,21 +13,39 @@ from typing import Any
 
 import numpy as np
 
-from tailgate.engine.array import Traced, chosen, each, lifted, result_type, shared_batch, typed
+from tailgate.engine import reductions
+from tailgate.engine.array import NEW, Traced, chosen, lifted, result_type, shared_batch, stored, typed
 from tailgate.engine.buffers import boxed, swept, wide
 from tailgate.engine.graph import Graph, Node
-from tailgate.engine.operations import Array, ArrayLike, Axis, DTypeLike, Shape
+from tailgate.engine.operations import BOOL, Array, ArrayLike, DTypeLike, Shape
+from tailgate.engine.operators import python_number
 from tailgate.engine.untraceable import Untraceable
 
 
 def called(graph: Graph, function: Callable[..., object], args: Sequence[Any], options: dict[str, Any]) -> Any:
     """Return the result of a numpy function; arrays that are the same for all episodes go to numpy itself."""
-    if function in _FUNCTIONS:
-        return _FUNCTIONS[function](*args, **options)
+    if mine := _FUNCTIONS.get(function):
+        try:
+            _signature(mine).bind(*args, **options)
+        except TypeError as error:
+            raise Untraceable(f"np.{function.__name__}: {error}", "give other arguments, or write elementwise functions") from None
+        return mine(*args, **options)
     held = [x for x in _inside((args, tuple(options.values()))) if isinstance(x, Traced)]
     if all(x.fixed for x in held):
         return function(*_known(args), **{name: _known(x) for name, x in options.items()})
     raise Untraceable(f"np.{function.__name__}", "write it with elementwise functions, num.* or np.where")
+
+
+_signature = functools.cache(inspect.signature)
+
+
+def method(name: str) -> Callable[..., Any]:
+    """Return a method of numpy's arrays, by the function of that name."""
+    if name in _METHODS:
+        return _FUNCTIONS[getattr(np, name)]
+    if hasattr(np.ndarray, name):
+        raise Untraceable(f"x.{name}", "write it with elementwise functions, num.* or np.where")
+    raise AttributeError(f"'numpy.ndarray' object has no attribute '{name}'")
 
 
 def _inside(x: object) -> Iterator[object]:
@@ -40,7 +59,7 @@ def _inside(x: object) -> Iterator[object]:
 def _known(x: object) -> Any:
     if isinstance(x, (tuple, list)):
         return type(x)(_known(part) for part in x)
-    return x.values() if isinstance(x, Traced) else x
+    return (x.values() if x.weak is None else python_number(x)) if isinstance(x, Traced) else x
 
 
 # -- several arrays in one
@@ -49,7 +68,7 @@ def _known(x: object) -> Any:
 def _joined(arrays: Sequence[Any], join: Callable[[list[Any]], Any]) -> Traced:
     graph = next(a.graph for a in arrays if isinstance(a, Traced))
     parts = [lifted(graph, a) for a in arrays]
-    dtype = result_type(parts)
+    dtype = np.result_type(*(part.dtype for part in parts))
     parts = [typed(graph, part, dtype) for part in parts]
     back = shared_batch(parts)
     nodes = join([part.nodes for part in parts])
@@ -58,6 +77,8 @@ def _joined(arrays: Sequence[Any], join: Callable[[list[Any]], Any]) -> Traced:
         shadows = [np.zeros([2 if i - p.ndim == back else n for i, n in enumerate(p.shape)], np.int8) for p in parts]
         moved = [i for i, (m, n) in enumerate(zip(join(shadows).shape, nodes.shape, strict=True)) if m != n]
         batch = moved[0] if moved else None
+        if batch is not None and nodes.shape[batch] != 1:
+            raise Untraceable("several rows of one episode", "join along another axis")
     return Traced(graph, nodes, dtype, batch)
 
 
@@ -85,37 +106,12 @@ def _full_like(
     x: Traced, value: ArrayLike, dtype: DTypeLike | None = None, order: str = "K", subok: bool = True, shape: Shape | None = None
 ) -> Traced:
     out = made(x.graph, x.shape if shape is None else shape, value, np.dtype(dtype or x.dtype))
-    out.batch = x.batch if shape is None else None
+    out._batch = x.batch if shape is None and x.batch is not None else NEW
     return out
 
 
 def _likes(value: ArrayLike) -> Callable[..., Traced]:
     return lambda x, dtype=None, order="K", subok=True, shape=None: _full_like(x, value, dtype, shape=shape)
-
-
-def _least(x: Traced, axis: int, op: str) -> Traced:
-    """Return the index of the smallest or largest number along an axis, the first of several; or of the first NaN."""
-    if axis is None or (x.batch is not None and axis % x.ndim == x.batch):
-        raise Untraceable("the place of one number of all episodes", "name another axis")
-    graph, parts = x.graph, [np.take(x.nodes, i, axis) for i in range(x.shape[axis])]
-    best, place = parts[0], each(graph, lambda node: graph.const(0, np.dtype(np.int64)), parts[0])
-    for i, part in enumerate(parts[1:], 1):
-        better = each(graph, lambda p, b: _wins(graph, op, p, b), part, best)
-        best = each(graph, graph.select, better, part, best)
-        place = each(graph, lambda c, k, i=i: graph.select(c, graph.const(i, np.dtype(np.int64)), k), better, place)
-    shadow = x._moved(lambda n: n.take(0, axis))
-    return Traced(graph, place, np.dtype(np.int64), shadow.batch)
-
-
-def _wins(graph: Graph, op: str, p: Node, b: Node) -> Node:
-    better = graph.binary(op, p, b)
-    if p.dtype.kind != "f":
-        return better
-    return graph.binary("or", better, graph.binary("and", graph.binary("ne", p, p), graph.binary("eq", b, b)))
-
-
-def _count_nonzero(x: Traced, axis: Axis = None, keepdims: bool = False) -> Traced:
-    return x.astype(bool).astype(np.int64).sum(axis=axis, keepdims=keepdims)
 
 
 def _is_in(x: Traced, values: ArrayLike, invert: bool = False) -> Array:
@@ -137,16 +133,45 @@ def _untold(what: str, instead: str) -> Any:
 
 
 def _copyto(target: Traced, source: ArrayLike, casting: str = "same_kind", where: ArrayLike = True) -> None:
-    if not np.can_cast(getattr(source, "dtype", np.asarray(source).dtype), target.dtype, casting):  # type: ignore[arg-type]
+    if not np.can_cast(lifted(target.graph, source).dtype, target.dtype, casting):  # type: ignore[arg-type]
         raise TypeError(f"np.copyto cannot cast to {target.dtype} according to the rule {casting!r}")
     target[...] = source if where is True else chosen(where, source, target, target.dtype)
 
 
-def _choose(conditions: Sequence[Array], choices: Sequence[ArrayLike], default: ArrayLike = 0) -> ArrayLike:
-    out = default
-    for condition, choice in zip(reversed(conditions), reversed(choices), strict=True):
-        out = np.where(condition, choice, out)
+def _choose(condlist: Sequence[Array], choicelist: Sequence[ArrayLike], default: ArrayLike = 0) -> ArrayLike:
+    graph = next(x.graph for x in _inside((tuple(condlist), tuple(choicelist), default)) if isinstance(x, Traced))
+    to = result_type([lifted(graph, x) for x in (*choicelist, default)])
+    out: Array = stored(graph, default, to)
+    for condition, choice in zip(reversed(condlist), reversed(choicelist), strict=True):
+        if lifted(graph, condition).dtype != BOOL:
+            raise TypeError("np.select asks for conditions of type bool")
+        out = chosen(condition, choice, out, to)
     return out
+
+
+def _clipped(
+    a: Traced, a_min: ArrayLike | None = None, a_max: ArrayLike | None = None, *, min: ArrayLike | None = None, max: ArrayLike | None = None
+) -> Array:  # fmt: skip
+    low, high = a_min if min is None else min, a_max if max is None else max
+    if a.dtype.kind in "iu":  # numpy drops the limits of Python's that the type cannot pass
+        limits, (low, high) = np.iinfo(a.dtype), (python_number(x) if getattr(x, "weak", None) else x for x in (low, high))
+        low, high = None if type(low) is int and low <= limits.min else low, None if type(high) is int and high >= limits.max else high
+    if low is None:
+        return np.positive(a) if high is None else np.minimum(a, high)
+    if high is None:
+        return np.maximum(a, low)
+    kind = result_type([lifted(a.graph, x) for x in (a, low, high)])
+    one, least, most = (stored(a.graph, x, kind) for x in (a, low, high))
+    if least.ndim or most.ndim:
+        return np.minimum(np.maximum(one, least), most)
+    above = np.where(least == least, np.where(one < least, least, one), least)  # zeros keep their sign
+    return np.where(most == most, np.where(above > most, most, above), most)
+
+
+def _along(x: Traced, move: Callable[[Array, int], Array], axis: int) -> Traced:
+    if x.batch is not None and axis % x.ndim == x.batch:
+        raise Untraceable("another order of the episodes", "name another axis")
+    return x._moved(lambda a: move(a, axis), copied=True)
 
 
 _FUNCTIONS: dict[Any, Callable[..., Any]] = {
@@ -160,29 +185,31 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.zeros_like: _likes(0),
     np.ones_like: _likes(1),
     np.empty_like: _likes(0),
-    np.swapaxes: lambda x, i, j: x.swapaxes(i, j),
+    np.swapaxes: lambda x, axis1, axis2: x._moved(lambda a: a.swapaxes(axis1, axis2)),
     np.transpose: lambda x, axes=None: x.transpose(axes) if axes is not None else x.transpose(),
-    np.moveaxis: lambda x, source, to: x._moved(lambda a: np.moveaxis(a, source, to)),
+    np.moveaxis: lambda x, source, destination: x._moved(lambda a: np.moveaxis(a, source, destination)),
     np.expand_dims: lambda x, axis: x._moved(lambda a: np.expand_dims(a, axis)),
-    np.squeeze: lambda x, axis: x.squeeze(axis),
+    np.squeeze: lambda x, axis: x._moved(lambda a: a.squeeze(axis)),
     np.reshape: lambda x, shape, order="C": x.reshape(shape, order=order),
-    np.ravel: lambda x, order="C": x.ravel(),
-    np.diagonal: lambda x, offset=0, axis1=0, axis2=1: x.diagonal(offset, axis1, axis2),
+    np.ravel: lambda x, order="C": x.reshape(-1, order=order),
+    np.diagonal: lambda x, offset=0, axis1=0, axis2=1: x._moved(lambda a: a.diagonal(offset, axis1, axis2)),
     np.tile: lambda x, reps: _untold("np.tile", "np.concatenate") if isinstance(reps, tuple) else _tiled(x, operator.index(reps)),
     np.repeat: lambda x, repeats, axis: x._moved(lambda a: np.repeat(a, repeats, axis), copied=True),
-    np.roll: lambda x, shift, axis: x._moved(lambda a: np.roll(a, shift, axis), copied=True),
-    np.flip: lambda x, axis: x._moved(lambda a: np.flip(a, axis)),
-    np.clip: lambda x, low, high: np.minimum(np.maximum(x, low), high),
-    np.any: lambda x, axis=None, keepdims=False: x.any(axis, keepdims=keepdims),
-    np.all: lambda x, axis=None, keepdims=False: x.all(axis, keepdims=keepdims),
-    np.max: lambda x, axis=None, keepdims=False: x.max(axis, keepdims=keepdims),
-    np.min: lambda x, axis=None, keepdims=False: x.min(axis, keepdims=keepdims),
-    np.amax: lambda x, axis=None, keepdims=False: x.max(axis, keepdims=keepdims),
-    np.amin: lambda x, axis=None, keepdims=False: x.min(axis, keepdims=keepdims),
-    np.sum: lambda x, axis=None, dtype=None, keepdims=False: x.sum(axis, dtype, keepdims=keepdims),
-    np.count_nonzero: _count_nonzero,
-    np.argmin: lambda x, axis=None: _least(x, axis, "lt"),
-    np.argmax: lambda x, axis=None: _least(x, axis, "gt"),
+    np.roll: lambda x, shift, axis: _along(x, lambda a, at: np.roll(a, shift, at), axis),
+    np.flip: lambda x, axis: _along(x, np.flip, axis),
+    np.clip: _clipped,
+    np.any: reductions.any_of,
+    np.all: reductions.all_of,
+    np.max: reductions.largest,
+    np.min: reductions.smallest,
+    np.amax: reductions.largest,
+    np.amin: reductions.smallest,
+    np.sum: reductions.total,
+    np.prod: reductions.product,
+    np.mean: reductions.mean,
+    np.count_nonzero: reductions.counted,
+    np.argmin: reductions.place_of_smallest,
+    np.argmax: reductions.place_of_largest,
     np.isin: _is_in,
     np.cumsum: lambda x, axis: np.add.accumulate(x, axis),
     np.copyto: _copyto,
@@ -193,6 +220,10 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.iscomplexobj: lambda x: False,
     np.isrealobj: lambda x: True,
 }
+_METHODS = (
+    "all", "any", "argmax", "argmin", "clip", "cumsum", "diagonal", "max", "mean", "min", "prod", "ravel", "repeat", "squeeze", "sum",
+    "swapaxes",
+)  # fmt: skip
 
 
 # -- tables
@@ -239,13 +270,10 @@ def _halved(ring: Array, place: ArrayLike, first: int, last: int) -> Array:
 def made(graph: Graph, shape: Shape, value: ArrayLike, dtype: np.dtype[Any]) -> Traced:
     """Return a new array filled with a value."""
     size = (int(shape),) if isinstance(shape, (int, np.integer)) else tuple(shape)
-    nodes = np.empty(size, object)
-    if isinstance(value, Traced) or np.ndim(value):
-        out = Traced(graph, nodes, dtype)
-        out[...] = value
-        return out
-    nodes.fill(graph.const(value, dtype))
-    return Traced(graph, nodes, dtype)
+    out = Traced(graph, np.empty(size, object), dtype, NEW)
+    out.nodes.fill(graph.const(0, dtype))
+    out[...] = value
+    return out
 
 
 _LIBRARIES = ("numpy", "scipy", "torch", "filterpy", "cvxpy", "gymnasium", "llvmlite")
@@ -264,7 +292,9 @@ def _makers(graph: Graph) -> dict[str, Callable[..., Any]]:
     def as_array(x: object, dtype: DTypeLike | None = None, order: str | None = None, copy: bool | None = None) -> Any:
         if isinstance(x, (list, tuple)) and any(isinstance(part, Traced) for part in _inside(x)):
             x = _stack([as_array(part) for part in x])
-        return x if not isinstance(x, Traced) or dtype is None else x.astype(dtype, copy=False)
+        if not isinstance(x, Traced):
+            return x
+        return (x if x.weak is None else x.copy()) if dtype is None else x.astype(dtype, copy=False)
 
     def contiguous(x: object, dtype: DTypeLike | None = None) -> Any:
         held = as_array(x, dtype)

@@ -24,15 +24,17 @@ def known_index(part: Traced) -> Any:
     return found if found.ndim else operator.index(found[()])
 
 
-def check_whole(x: Traced, key: tuple[Any, ...]) -> None:
-    """Raise Untraceable for a slice that takes some of the episodes, or in another order."""
-    if x.batch is None:
+def check_whole(x: Traced, key: tuple[Any, ...], written: bool = False) -> None:
+    """Raise Untraceable for a slice that takes some of the episodes, or in another order, or for one episode that is `written` to."""
+    batch = 0 if written and x.batch is None and x.ndim > 1 and x.shape[0] == 1 else x.batch  # of np.zeros((len(y), 3)), maybe
+    if batch is None:
         return
     parts = [part for part in key if part is not None]
     wide = [0 if part is Ellipsis else np.ndim(part) if getattr(part, "dtype", None) == BOOL else 1 for part in parts]
     axis = 0
     for part, size in zip(parts, wide, strict=True):
         size = x.ndim - sum(wide) if part is Ellipsis else size
-        if axis <= x.batch < axis + size and isinstance(part, slice) and part not in ALL:
+        one = written and isinstance(part, (int, np.integer)) and not isinstance(part, bool)
+        if axis <= batch < axis + size and (one or (isinstance(part, slice) and part not in ALL)):
             raise Untraceable("some of the episodes, or another order of them", "write it for all rows")
         axis += size

@@ -58,32 +58,3 @@ def apply(op: str, dtype: np.dtype[Any], args: Sequence[Any]) -> Any:
     if op == "bits":
         return args[0].view(dtype)
     return (UNARY.get(op) or BINARY.get(op) or COMPARISONS[op])(*args)
-
-
-def with_operators(kind: type[T]) -> type[T]:
-    """Define Python's operators of a class by numpy's functions, also reflected and in place."""
-    pairs = {
-        "add": np.add, "sub": np.subtract, "mul": np.multiply, "truediv": np.true_divide, "floordiv": np.floor_divide, "mod": np.remainder,
-        "and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor, "lshift": np.left_shift, "rshift": np.right_shift,
-        "matmul": np.matmul,
-    }  # fmt: skip
-
-    def plain(ufunc: np.ufunc) -> Callable[[Any, Any], Any]:
-        return lambda self, other: ufunc(self, other)
-
-    def reflected(ufunc: np.ufunc) -> Callable[[Any, Any], Any]:
-        return lambda self, other: ufunc(other, self)
-
-    def in_place(ufunc: np.ufunc) -> Callable[[Any, Any], Any]:
-        return lambda self, other: ufunc(self, other, out=(self,)) if self.ndim else ufunc(self, other)  # a number cannot be written to
-
-    for name, ufunc in pairs.items():
-        setattr(kind, f"__{name}__", plain(ufunc))
-        setattr(kind, f"__r{name}__", reflected(ufunc))
-        setattr(kind, f"__i{name}__", in_place(ufunc))
-    comparisons = {"lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal, "eq": np.equal, "ne": np.not_equal}
-    for name, ufunc in comparisons.items():
-        setattr(kind, f"__{name}__", plain(ufunc))
-    for name, single in {"neg": np.negative, "abs": np.absolute, "invert": np.invert, "pos": np.positive}.items():
-        setattr(kind, f"__{name}__", (lambda ufunc: lambda self: ufunc(self))(single))
-    return kind

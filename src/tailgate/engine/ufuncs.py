@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from tailgate.engine.array import WIDEST, Traced, each, elementwise, lifted, reduced, summands, typed
+from tailgate.engine.array import Traced, elementwise, lifted, typed
 from tailgate.engine.graph import Graph, Node
-from tailgate.engine.operations import BOOL, COMPARISONS, SMALL, Array, ArrayLike, DTypeLike
+from tailgate.engine.operations import BOOL, COMPARISONS, DTYPES, Array, ArrayLike, DTypeLike
+from tailgate.engine.operators import python_number
+from tailgate.engine.reductions import ON_BOOLS, accumulated, by_function
 from tailgate.engine.untraceable import Untraceable
 
 _PAIRS: dict[np.ufunc, str] = {
@@ -24,8 +25,6 @@ _SINGLES: dict[np.ufunc, str] = {
     np.rint: "rint", np.invert: "not", np.logical_not: "not",
 }  # fmt: skip
 _LOGICAL = {np.logical_and, np.logical_or, np.logical_xor, np.logical_not}
-_ON_BOOLS = {"add": "or", "mul": "and", "min": "and", "max": "or"}
-_UNBOUNDED = {"add": operator.add, "sub": operator.sub, "mul": operator.mul, "shl": operator.lshift, "shr": operator.rshift}
 _LIBRARY = {
     np.exp: "num.exp",
     np.log: "num.log",
@@ -38,15 +37,15 @@ _LIBRARY = {
 def called(graph: Graph, ufunc: np.ufunc, method: str, inputs: Sequence[ArrayLike], options: dict[str, Any]) -> Any:
     """Return the result of a universal function."""
     out = options.pop("out", None)
-    if any(isinstance(target, np.ndarray) for target in out or ()):
+    if any(not isinstance(target, Traced) for target in out or ()):
         raise Untraceable("writing a traced array into one of numpy's", "make it with np.zeros or np.empty in the same function")
     arrays = [lifted(graph, x) for x in inputs]
     if all(a.fixed for a in arrays) and method == "__call__" and not (ufunc in _PAIRS or ufunc in _SINGLES):
-        result: Array = lifted(graph, ufunc(*(a.values() for a in arrays), **options))
+        result: Array = lifted(graph, ufunc(*(a.values() if a.weak is None else python_number(a) for a in arrays), **options))
     elif method == "reduce":
-        result = _reduced(ufunc, arrays[0], options)
+        result = by_function(ufunc, _PAIRS.get(ufunc), arrays[0], options)
     elif method == "accumulate":
-        result = _accumulated(ufunc, arrays[0], **options)
+        result = accumulated(ufunc, _PAIRS.get(ufunc), arrays[0], **options)
     elif method == "__call__" and set(options) <= {"dtype", "casting", "where"}:
         result = _elementwise(graph, ufunc, arrays, options.get("dtype"))
         if options.get("where", True) is not True:
@@ -62,11 +61,9 @@ def called(graph: Graph, ufunc: np.ufunc, method: str, inputs: Sequence[ArrayLik
 
 
 def _elementwise(graph: Graph, ufunc: np.ufunc, arrays: list[Traced], dtype: DTypeLike | None) -> Array:
-    if ufunc in _DERIVED:
+    if ufunc in _DERIVED and dtype is None:
         return _DERIVED[ufunc](*arrays)
     op = _PAIRS.get(ufunc) or _SINGLES.get(ufunc)
-    if op in _UNBOUNDED and all(a.weak in (int, bool) for a in arrays) and (op in ("shl", "shr") or any(_large(a) for a in arrays)):
-        return lifted(graph, _UNBOUNDED[op](*(a.values().item() for a in arrays)))  # Python's whole numbers have no end
     if op is None:
         raise Untraceable(f"np.{ufunc.__name__}", f"write {_LIBRARY.get(ufunc, 'it with +, -, *, /, np.sqrt, np.where')}")
     kinds = [BOOL] * len(arrays) if ufunc in _LOGICAL else loop_types(ufunc, arrays)
@@ -75,13 +72,15 @@ def _elementwise(graph: Graph, ufunc: np.ufunc, arrays: list[Traced], dtype: DTy
             raise Untraceable(f"np.{ufunc.__name__} with dtype={np.dtype(dtype)}", "compare without it")
     elif dtype is not None:
         kinds = [np.dtype(dtype)] * len(arrays)
+        if not all(np.can_cast(a.dtype, kinds[0], "same_kind") for a in arrays):
+            raise TypeError(f"np.{ufunc.__name__} cannot compute with {kinds[0]} without a loss")
     elif len(arrays) > 1 and ufunc not in _LOGICAL and kinds[0].kind in "iu":
         kinds = [_exact(ufunc, op, arrays, kinds[0])] * len(arrays)
-    if any(kind.kind not in "fiub" for kind in kinds):
-        raise Untraceable(f"np.{ufunc.__name__} of {', '.join(map(str, kinds))}", "use real numbers")
+    if any(kind not in DTYPES for kind in kinds):
+        raise Untraceable(f"np.{ufunc.__name__} of {', '.join(map(str, kinds))}", "use real numbers of 32 or 64 bits")
     arrays = [typed(graph, a, kind) for a, kind in zip(arrays, kinds, strict=True)]
     if kinds[0] == BOOL:
-        op = _ON_BOOLS.get(op, op)
+        op = ON_BOOLS.get(op, op)
     if op in ("rem", "shl", "shr"):
         return _by_a_constant(graph, op, arrays, kinds[0])
     if len(arrays) == 1:
@@ -89,15 +88,10 @@ def _elementwise(graph: Graph, ufunc: np.ufunc, arrays: list[Traced], dtype: DTy
     return elementwise(graph, lambda x, y: graph.binary(op, x, y), arrays, BOOL if op in COMPARISONS else kinds[0])
 
 
-def _large(x: Traced) -> bool:
-    """Return True for a whole number of Python in the code, and no parameter, of which few products leave 64 bits."""
-    return x.size == 1 and x.nodes.item().op == "const" and abs(int(x.nodes.item().attr)) >= SMALL
-
-
 def _exact(ufunc: np.ufunc, op: str, arrays: Sequence[Traced], kind: np.dtype[Any]) -> np.dtype[Any]:
     """Return the type in which narrow whole numbers meet Python's: numpy compares them as they are, and computes with no others."""
     limits = np.iinfo(kind)
-    asked = [a for a in arrays if a.weak is int and a.size == 1 and (kind.itemsize < 8 or a.nodes.item().op == "const")]
+    asked = [a for a in arrays if a.weak is int and a.size == 1 and (kind.itemsize < 8 or kind.kind == "u" or a.nodes.item().op == "const")]
     wrong = [a for a in asked if not limits.min <= a.values().item() <= limits.max]  # a parameter is small (SMALL)
     if not wrong:
         return kind
@@ -158,34 +152,9 @@ def _partly(result: Array, where: ArrayLike, out: Sequence[Array] | None) -> Tra
     return chosen(where, result, out[0])
 
 
-def _reduced(ufunc: np.ufunc, x: Traced, options: dict[str, Any]) -> Traced:
-    op, axis = _PAIRS.get(ufunc), options.get("axis", 0)
-    if op not in ("add", "mul", "min", "max", "and", "or") or set(options) - {"axis", "keepdims", "dtype"}:
-        raise Untraceable(f"np.{ufunc.__name__}.reduce", "write a loop over the axis")
-    if ufunc in _LOGICAL:
-        x = typed(x.graph, x, BOOL)
-    elif op in ("add", "mul"):
-        x = summands(x, axis, options.get("dtype"))
-    return reduced(x, _ON_BOOLS.get(op, op) if x.dtype == BOOL else op, axis, options.get("keepdims", False))
-
-
-def _accumulated(ufunc: np.ufunc, x: Traced, axis: int = 0) -> Traced:
-    op = _PAIRS.get(ufunc)
-    if op not in ("add", "mul", "min", "max", "and", "or"):
-        raise Untraceable(f"np.{ufunc.__name__}.accumulate", "write a loop over the axis")
-    if op in ("add", "mul"):
-        x = typed(x.graph, x, np.dtype(WIDEST.get(x.dtype.kind, x.dtype)))
-    if x.batch == axis % x.ndim:
-        raise Untraceable("an accumulation over the episodes", "name another axis")
-    nodes = np.empty(x.shape, object)
-    there, source = np.moveaxis(nodes, axis, 0), np.moveaxis(x.nodes, axis, 0)
-    for i in range(len(source)):
-        there[i] = source[i] if i == 0 else each(x.graph, lambda p, q: x.graph.binary(op, p, q), there[i - 1], source[i])
-    return Traced(x.graph, nodes, x.dtype, x.batch)
-
-
-def _sign(x: Array) -> Array:
-    found = np.where(x > 0, 1, np.where(x < 0, -1, 0)).astype(x.dtype)
+def _sign(x: Traced) -> Array:
+    x = typed(x.graph, x, loop_types(np.sign, [x])[0])
+    found: Array = np.where(x > 0, 1, np.where(x < 0, -1, 0)).astype(x.dtype)
     return np.where((x == 0) | (found != 0), found, x) if x.dtype.kind == "f" else found
 
 
@@ -203,8 +172,8 @@ def _copied_sign(x: Traced, y: Traced) -> Array:
 
 
 _DERIVED: dict[np.ufunc, Callable[..., Array]] = {
-    np.square: lambda x: x * x,
-    np.positive: lambda x: x.copy(),
+    np.square: lambda x: np.multiply(*[x.astype(loop_types(np.square, [x])[0], copy=False)] * 2),
+    np.positive: lambda x: x.astype(loop_types(np.positive, [x])[0]),
     np.reciprocal: _reciprocal,
     np.isfinite: lambda x: np.absolute(x) < np.inf,
     np.isnan: lambda x: x != x,
