@@ -255,7 +255,8 @@ class TracedEpisodes:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         programs = programs_of(state["seat"], state["device"])
-        assert isinstance(programs, SeatPrograms), "it was traced before"
+        if not isinstance(programs, SeatPrograms):
+            raise InputError("engine", "a copy of a traced environment", f"what was traced before: {programs.why}")
         self.__init__(programs, state["drawn"], state["threads"])  # type: ignore[misc]
         if state["held"] is not None:
             batch, held, brought = state["held"]

@@ -17,10 +17,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from tailgate.base.errors import InputError
 from tailgate.base.pytree import leaves, map_leaves, widened
 from tailgate.core import draws
 from tailgate.core.draws import Keys
-from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
+from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, compared, raised, same
 from tailgate.engine.operations import Array, ArrayLike
 from tailgate.engine.parameters import lifted
 from tailgate.engine.program import Call, program_class
@@ -180,23 +181,28 @@ def programs_of(seat: Seat, device: str = "cpu") -> SeatPrograms | Untraced:
     )
 
 
-def difference(programs: SeatPrograms, batch: int = ROWS, steps: int = TRIED) -> str:
+def difference(programs: SeatPrograms, steps: int = TRIED) -> str:
     """Play some decisions with resets in both engines; return the first difference, or nothing."""
+    return compared(lambda rows: _compared(programs, rows, steps))
+
+
+def _compared(programs: SeatPrograms, some: list[int], steps: int) -> str | tuple[InputError, int]:
     from tailgate.envs.gym.batches import PlainEpisodes
 
     decisions = max(4, steps // (programs.between + 1))
     chance, size = np.random.default_rng(0), programs.seat.action.size
-    keys, everyone = draws.keys("tune", range(batch)), np.ones(batch, bool)
+    batch = len(some)
+    keys, everyone = draws.keys("tune", some), np.ones(batch, bool)
     rows, plain = Rows(programs, batch), PlainEpisodes(programs.seat)
     rows.begin(everyone, keys)
     plain.begin(keys)
     for decision in range(decisions):
-        over = chance.random(batch) < (0.5 if decision == decisions // 2 else 0.02)
-        actions = chance.integers(0, size, batch) if programs.seat.action.discrete else chance.uniform(-1.0, 1.0, (batch, size))
+        over = chance.random(ROWS)[some] < (0.5 if decision == decisions // 2 else 0.02)  # an episode does the same without the others
+        actions = (chance.integers(0, size, ROWS) if programs.seat.action.discrete else chance.uniform(-1.0, 1.0, (ROWS, size)))[some]
         broken, outcome = raised(lambda: rows.decide(actions, over, over)), raised(lambda: plain.decide(actions, over, True))  # noqa: B023
-        if isinstance(outcome, str):
-            return "" if broken == outcome else f"decision {decision}: {outcome}"
-        if isinstance(broken, str):
+        if isinstance(outcome, InputError):
+            return (outcome, decision) if str(broken) == str(outcome) else f"decision {decision}: {outcome}"
+        if isinstance(broken, InputError):
             return f"decision {decision}: {broken}"
         here, there = rows.held() | rows.brought, plain.held() | outcome._asdict() | {"seen": plain.seen()}
         for name, wanted in there.items():

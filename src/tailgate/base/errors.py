@@ -13,10 +13,15 @@ R = TypeVar("R")
 class InputError(ValueError):
     """Bad input: one line names the field, the value and the expectation.
 
-    `row` is the index of the episode in the batch that the error is about, or None.
+    `rows` are the indices of the episodes in the batch that the error is about; `row` is the first, or None.
     """
 
-    row: int | None = None
+    rows: tuple[int, ...] = ()
+
+    @property
+    def row(self) -> int | None:
+        """The first of the rows."""
+        return self.rows[0] if self.rows else None
 
     def __init__(self, field: str, value: object, expected: str) -> None:
         shown = " ".join(repr(value).split())

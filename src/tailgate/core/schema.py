@@ -145,7 +145,7 @@ def as_data(value: object) -> Any:
     """Return parameters as plain JSON data: the class and every field. Empty fields that are marked `if_any` are left out."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         kind = type(value)
-        shown = [f.name for f in dataclasses.fields(value) if f.init and (getattr(value, f.name) or not f.metadata.get("if_any"))]
+        shown = [f.name for f in dataclasses.fields(value) if f.init and (not f.metadata.get("if_any") or getattr(value, f.name))]
         fields = {name: as_data(getattr(value, name)) for name in shown}
         return {"class": published(kind), **fields}
     if isinstance(value, dict):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from tailgate.base.errors import InputError
-from tailgate.base.pytree import leaves
+from tailgate.base.pytree import leaves, map_leaves
 from tailgate.engine.operations import Array
 from tailgate.engine.untraceable import Untraceable
 
@@ -21,6 +21,7 @@ T = TypeVar("T")
 S = TypeVar("S")
 L = TypeVar("L", bound="Defended")
 TRIED, ROWS = 24, 64  # steps and episodes in which new code is compared with the plain loop
+FEW, ENOUGH = 8, 2  # episodes that are compared further where others end with an error, and steps that suffice if fewer are left
 
 
 class Untraced(NamedTuple):
@@ -55,12 +56,25 @@ def explained(error: Exception) -> str:
     return f"{place}{type(error).__name__}: {' '.join(str(error).split())[:300]}"
 
 
-def raised(play: Callable[[], T]) -> T | str:
-    """Call `play`; return its result or the text of its InputError."""
+def raised(play: Callable[[], T]) -> T | InputError:
+    """Call `play`; return its result or its InputError."""
     try:
         return play()
     except InputError as error:
-        return str(error)
+        return error
+
+
+def compared(compare: Callable[[list[int]], str | tuple[InputError, int]]) -> str:
+    """Compare two engines on the episodes `rows`; where some end both with an equal error, after a number of steps, go on without them."""
+    rows, most = list(range(ROWS)), 0
+    while True:
+        answer = compare(rows)
+        if isinstance(answer, str):
+            return answer
+        error, steps = answer
+        rows, most = [row for i, row in enumerate(rows) if i not in error.rows], max(most, steps)
+        if not error.rows or len(rows) < FEW:
+            return "" if most >= ENOUGH else f"nothing that can be told: most episodes end with an error, such as {error}"
 
 
 def apart(
@@ -68,23 +82,32 @@ def apart(
 ) -> str:  # fmt: skip
     """Play some steps of a program without arguments, and the same by the plain `step`; return the first difference, or nothing.
 
-    begun: the state of ROWS episodes. step: returns the next state and its results. later: the state some steps (ROWS,) later.
+    begun: the state of some episodes. step: returns the next state and its results. later: the state some steps (B,) later.
     In the second half of the steps, every other episode goes on at a later step. What begins late, such as an attack, is compared too.
     """
-    steps = min(TRIED, horizon)
-    state = program.rows(ROWS)
+    steps, first = min(TRIED, horizon), begun
+    rows = len(next(iter(leaves(begun).values())))
+    state = program.rows(rows)
     state.put(begun)
     call = program.call(state, 2)  # the form that plays: several steps, of which each is one
     for number in range(1, steps + 1):
         if number == steps // 2 + 1:
-            begun = later(begun, np.linspace(0, horizon - steps, ROWS).astype(np.int64) * (np.arange(ROWS) % 2))
+            begun = later(begun, np.linspace(0, horizon - steps, rows).astype(np.int64) * (np.arange(rows) % 2))
             state.put(begun)
         call.begin()
         call.play(1)
         results = {name: value[0] for name, value in call.results().items()}
         found = raised(lambda: step(begun))  # noqa: B023
-        if isinstance(found, str):
-            return "" if not results["demands"].all() else f"step {number}: {found}"
+        if isinstance(found, InputError):
+            broken = ~results["demands"].all(axis=1) if "demands" in results else np.zeros(rows, bool)
+            if not broken.any():
+                return f"step {number}: {found}"
+            kept = np.flatnonzero(~broken)
+            if len(kept) < FEW and number > ENOUGH:
+                return ""
+            if len(kept) < FEW:
+                return f"nothing that can be told: most episodes end with an error, such as {found}"
+            return apart(program, map_leaves(lambda leaf: leaf[kept], first), step, horizon, later)  # noqa: B023
         begun, wanted = found
         got, held = results | {name: state.get_leaf(name) for name in program.places}, leaves(begun) | dict(wanted)
         for name in (*program.places, *wanted):

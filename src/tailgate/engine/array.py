@@ -292,6 +292,8 @@ def each(graph: Graph, function: Callable[..., Node], *arrays: Array) -> Array:
 def lifted(graph: Graph, x: ArrayLike, like: np.dtype[Any] | None = None) -> Traced:
     """Return x as a traced array; numbers become constants, and a Python number gets the type `like`."""
     if isinstance(x, Traced):
+        if x.graph is not graph:
+            raise Untraceable("a number of an earlier trace", "keep what changes in the state that start returns")
         return x
     weak = type(x) if type(x) in (bool, int, float) else None
     held = np.asarray(x, like if weak and like is not None else None)

@@ -65,9 +65,10 @@ class Elementwise:
     """A function of one float for arrays of any shape; traced code and short arrays use its Python source."""
 
     def __init__(self, function: Callable[[Array], Array], worth: int) -> None:
-        self.function, self.worth = function, worth
+        self.function: Callable[[Array], Array] = getattr(function, "function", function)  # a routine's own: its code is repeated
+        self.worth = worth
         self._code: Code | None = None
-        update_wrapper(self, function)
+        update_wrapper(self, function, updated=())
 
     def __call__(self, x: ArrayLike) -> Any:
         if isinstance(x, Traced):

@@ -6,10 +6,11 @@ import contextlib
 import functools
 import inspect
 import operator
+import os
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -19,21 +20,30 @@ from tailgate.engine.buffers import boxed, swept, wide
 from tailgate.engine.graph import Graph, Node
 from tailgate.engine.operations import BOOL, Array, ArrayLike, DTypeLike, Shape
 from tailgate.engine.operators import python_number
-from tailgate.engine.untraceable import Untraceable
+from tailgate.engine.untraceable import Untraceable, traces
 
 
 def called(graph: Graph, function: Callable[..., object], args: Sequence[Any], options: dict[str, Any]) -> Any:
     """Return the result of a numpy function; arrays that are the same for all episodes go to numpy itself."""
     if mine := _FUNCTIONS.get(function):
         try:
-            _signature(mine).bind(*args, **options)
+            given = _signature(mine).bind(*args, **options)
         except TypeError as error:
             raise Untraceable(f"np.{function.__name__}: {error}", "give other arguments, or write elementwise functions") from None
-        return mine(*args, **options)
+        out = given.arguments.pop("out", None)
+        made = mine(*given.args, **given.kwargs)
+        return made if out is None else _written(made, out)
     held = [x for x in _inside((args, tuple(options.values()))) if isinstance(x, Traced)]
     if all(x.fixed for x in held):
         return function(*_known(args), **{name: _known(x) for name, x in options.items()})
     raise Untraceable(f"np.{function.__name__}", "write it with elementwise functions, num.* or np.where")
+
+
+def _written(made: Traced, out: ArrayLike) -> Traced:
+    if not isinstance(out, Traced):
+        raise Untraceable("writing a traced array into one of numpy's", "make it with np.zeros or np.empty in the same function")
+    out[...] = made
+    return out
 
 
 _signature = functools.cache(inspect.signature)
@@ -42,7 +52,7 @@ _signature = functools.cache(inspect.signature)
 def method(name: str) -> Callable[..., Any]:
     """Return a method of numpy's arrays, by the function of that name."""
     if name in _METHODS:
-        return _FUNCTIONS[getattr(np, name)]
+        return cast(Callable[..., Any], getattr(np, name))
     if hasattr(np.ndarray, name):
         raise Untraceable(f"x.{name}", "write it with elementwise functions, num.* or np.where")
     raise AttributeError(f"'numpy.ndarray' object has no attribute '{name}'")
@@ -114,10 +124,10 @@ def _likes(value: ArrayLike) -> Callable[..., Traced]:
     return lambda x, dtype=None, order="K", subok=True, shape=None: _full_like(x, value, dtype, shape=shape)
 
 
-def _is_in(x: Traced, values: ArrayLike, invert: bool = False) -> Array:
-    """Return where x equals one of a few whole numbers, such as enumerations."""
-    found: Array = lifted(x.graph, np.zeros(x.shape, bool))
-    held = np.asarray(values)
+def _is_in(element: Traced, test_elements: ArrayLike, assume_unique: bool = False, invert: bool = False) -> Array:
+    """Return where numbers equal one of a few, such as enumerations."""
+    x, found = element, cast(Array, lifted(element.graph, np.zeros(element.shape, bool)))
+    held = np.asarray(test_elements)
     to = np.result_type(x.dtype, held.dtype)
     for value in held.ravel().astype(to):
         found = found | (x.astype(to, copy=False) == value)
@@ -279,6 +289,8 @@ def made(graph: Graph, shape: Shape, value: ArrayLike, dtype: np.dtype[Any]) -> 
 _LIBRARIES = ("numpy", "scipy", "torch", "filterpy", "cvxpy", "gymnasium", "llvmlite")
 _here = threading.local()
 _lock = threading.RLock()
+if hasattr(os, "register_at_fork"):  # a child has no thread that would release it, and would keep traced constructors
+    os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release)
 
 
 def _makers(graph: Graph) -> dict[str, Callable[..., Any]]:
@@ -307,9 +319,14 @@ def _makers(graph: Graph) -> dict[str, Callable[..., Any]]:
         held = as_array(x, dtype)
         return held.copy() if isinstance(held, Traced) and copy else held
 
+    def errstate(**kinds: Any) -> Any:
+        if {"raise", "call"} & set(map(str, kinds.values())):
+            raise Untraceable("np.errstate that raises", "write np.where with a condition")
+        return contextlib.nullcontext()
+
     return {
         "zeros": filled(0), "ones": filled(1), "empty": filled(0), "full": full, "asarray": as_array, "ascontiguousarray": contiguous,
-        "asanyarray": as_array, "array": array,
+        "asanyarray": as_array, "array": array, "errstate": errstate,
     }  # fmt: skip
 
 
@@ -344,14 +361,17 @@ def makers(graph: Graph) -> Iterator[None]:
         return maker
 
     with _lock:
-        outer = getattr(_here, "graph", None)
+        outer, refused = getattr(_here, "graph", None), getattr(traces, "refused", None)
+        traces.refused = mine = list[Untraceable]()
         before, _here.graph = {name: getattr(np, name) for name in _makers(graph)}, graph
         try:
-            for name, mine in _makers(graph).items():
-                setattr(np, name, wrapped(before[name], mine, name in _CONVERT))
+            for name, maker in _makers(graph).items():
+                setattr(np, name, wrapped(before[name], maker, name in _CONVERT))
             yield
+            if mine:  # also where the code went on without it
+                raise mine[0]
         finally:
-            _here.graph = outer
+            _here.graph, traces.refused = outer, refused
             for name, original in before.items():
                 setattr(np, name, original)
 

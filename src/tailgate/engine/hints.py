@@ -106,7 +106,7 @@ def broken(rows: Array, field: str, found: str, wanted: str, k: Array) -> InputE
     first = int(np.flatnonzero(rows)[0])
     where = f"{found} in step {k[first]}, in {np.count_nonzero(rows)} of {len(rows)} rows, the first of them row {first}"
     error = InputError(field, where, wanted)
-    error.row = first
+    error.rows = tuple(np.flatnonzero(rows).tolist())
     return error
 
 

@@ -24,6 +24,8 @@ VERSION = b"2"  # of this module's translation
 KEPT = 4000  # most recently used files in the folder
 BASIC = ".basic.o"  # how the names of the code of `tailgate.num` end
 _lock = threading.RLock()
+if hasattr(os, "register_at_fork"):  # a child has no thread that would release it
+    os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release)
 
 
 @cache

@@ -98,7 +98,7 @@ def _of_numbers(operate: Operator, parts: tuple[Any, ...], kinds: list[Any]) -> 
         return arrays[0]
     if name == "div" and not arrays[1].nonzero_places():
         raise ZeroDivisionError("division by zero")
-    if not name or (whole and any(_large(a) for a in arrays)):  # Python's whole numbers have no end
+    if not name or (whole and any(_large(a) or (name == "mul" and _made(a)) for a in arrays)):  # Python's whole numbers have no end
         return lifted(graph, operate(*map(python_number, arrays)))
     dtype = INT if whole and name != "div" else FLOAT
     made = elementwise(graph, _on_nodes(graph, name), [typed(graph, a, dtype) for a in arrays], BOOL if name in COMPARISONS else dtype)
@@ -112,6 +112,11 @@ def _on_nodes(graph: Any, name: str) -> Callable[..., Node]:
         return found
 
     return on_nodes
+
+
+def _made(x: Traced) -> bool:
+    """Return True for the result of an operation: a product of products may leave 64 bits."""
+    return x.nodes.item().op not in ("const", "uniform")
 
 
 def _large(x: Traced) -> bool:

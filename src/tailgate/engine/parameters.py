@@ -10,14 +10,10 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
-import enum
-import functools
 import hashlib
 import types
-import weakref
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
-from pathlib import PurePath
 from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
@@ -28,12 +24,10 @@ from tailgate.engine.array import Traced
 from tailgate.engine.buffers import boxed
 from tailgate.engine.graph import Graph, Node, ordered
 from tailgate.engine.operations import FLOAT, SMALL, Array
+from tailgate.engine.reads import BOXES, CODE, PLAIN, Read, Same, attributes, caches, filled, plain, refuse_nodes, stable
 
 T = TypeVar("T")
-MANY = 100  # numbers of a list that are compared by their bytes
 LARGE = 20_000  # numbers of an array that is used as it is, because code usually reads few of them
-_caches: weakref.WeakSet[Any] = weakref.WeakSet()  # of somebody's functions that traced code calls
-_PLAIN = (type(None), str, bytes, int, complex, enum.Enum, np.generic, np.dtype, type, types.BuiltinFunctionType, np.ufunc, PurePath)
 
 
 def lifted(like: Array, held: T) -> T:
@@ -47,7 +41,7 @@ class Snapshot(NamedTuple):
 
     code: tuple[Any, ...]
     values: list[bytes]
-    objects: list[tuple[Any, dict[str, Any]]]  # those that may change, with their attributes
+    objects: list[tuple[Any, dict[str, Any]]]  # those that may change, with the contents of their attributes
 
     def changed(self, now: Snapshot) -> str:
         """Return which object has changed since, by its class and attribute, or that a global has; empty if none."""
@@ -56,6 +50,39 @@ class Snapshot(NamedTuple):
                 if before.get(name) != after[name]:
                     return f"{type(one).__name__}.{name}"
         return "" if self[:2] == now[:2] else "a global"
+
+
+def _set_back(box: Any, content: dict[str, Any]) -> None:
+    """Give an object, also a frozen one, or a class its attributes back."""
+    write, erase = (type.__setattr__, type.__delattr__) if isinstance(box, type) else (object.__setattr__, object.__delattr__)
+    now = _content(box)
+    for name in now.keys() - content.keys():
+        erase(box, name)
+    for name, value in content.items():
+        if now.get(name, content) is not value:
+            write(box, name, value)
+
+
+class Contents(NamedTuple):
+    """What objects, containers and globals held at a time."""
+
+    boxes: list[tuple[Any, Any]]
+    rooms: list[tuple[dict[str, Any], str, Any]]
+
+    def put_back(self) -> None:
+        """Write it back."""
+        for box, content in self.boxes:
+            if isinstance(box, (np.ndarray, list)):
+                if box is not content:
+                    box[:] = content
+            elif isinstance(box, BOXES):
+                box.clear()
+                fill: Any = box.extend if isinstance(box, deque) else box.update  # type: ignore[union-attr]
+                fill(content)
+            else:
+                _set_back(box, content)
+        for room, name, value in self.rooms:
+            room[name] = value
 
 
 class Parameters:
@@ -67,6 +94,7 @@ class Parameters:
         self.values = reader.values
         self._classes = reader.classes
         self.kept = reader.kept  # objects known by their id must live as long as the key
+        self._read = reader.read
         self.code = tuple(reader.key)
         self.key = None if reader.changeable else self.code
 
@@ -78,28 +106,43 @@ class Parameters:
             digest.update(file.read_bytes())
         return digest.hexdigest()
 
+    @property
+    def unknown(self) -> str:
+        """What somebody's code reads and no key can tell apart, by class; empty if there is nothing."""
+        return ", ".join(sorted({type(one).__name__ for one in self._read.unknown}))
+
+    @property
+    def told(self) -> str:
+        """A hash of all that is no number, the same in other processes; empty for objects of Tailgate's own."""
+        if not any(editable(str(one.__module__)) for one in self._classes):
+            return ""
+        return hashlib.sha256(repr(stable(self.code)).encode()).hexdigest()
+
     def snapshot(self) -> Snapshot:
         """Return what the objects and the code that they name hold now."""
-        held = [(one, {name: _value(part, set()) for name, part in vars(one).items()}) for one in self._objects]
+        held = [(one, {name: Read().value(part) for name, part in attributes(one).items()}) for one in self._objects]
         return Snapshot(self.code, [leaf.tobytes() for leaf in self.values], held)
 
     @property
     def _objects(self) -> list[Any]:
-        return [one for one in self.kept if hasattr(one, "__dict__") and not isinstance(one, types.FunctionType)]
+        return [one for one in self.kept if attributes(one) and not isinstance(one, types.FunctionType)]
 
     @contextlib.contextmanager
     def restored(self) -> Iterator[None]:
-        """Give objects their attributes of before back after a trace, and empty caches that were filled in it: they hold nodes."""
-        before, caches = [(one, dict(vars(one))) for one in self._objects], {cache: cache.cache_info().misses for cache in list(_caches)}
+        """Put back what was written in a trace to objects, containers and globals, and empty caches that were filled: they hold nodes."""
+        before, misses = self.contents(), {cache: cache.cache_info().misses for cache in list(caches)}
         try:
             yield
         finally:
-            for one, attributes in before:
-                vars(one).clear()
-                vars(one).update(attributes)
-            for cache, misses in caches.items():
-                if cache.cache_info().misses != misses:
+            before.put_back()
+            for cache, count in misses.items():
+                if cache.cache_info().misses != count:
                     cache.cache_clear()
+
+    def contents(self) -> Contents:
+        """Return a shallow copy of what code may write to."""
+        boxes = [*self._objects, *self._read.boxes.values()]
+        return Contents([(box, _content(box)) for box in boxes], [(room, name, room[name]) for room, name in self._read.rooms])
 
 
 class Reading:
@@ -170,7 +213,9 @@ class _Reader:
         self.values: list[Array] = [] if graph is None else graph.parameters
         self.kept: list[Any] = []
         self.classes: dict[Any, None] = {}
+        self.read = Read()
         self.changeable = False
+        self._owned = False  # by an object of somebody else's class
         self._known: dict[int, tuple[int, Any, Any]] = {}
 
     def visit(self, held: object) -> Any:
@@ -178,25 +223,28 @@ class _Reader:
             leaf = np.array([held])
             (node,) = self._leaf(leaf)
             return held if self.graph is None else Traced(self.graph, boxed(node), leaf.dtype, None, type(held))
-        if isinstance(held, _PLAIN):
-            self.key += [type(held), _named(held)]
+        refuse_nodes(held)
+        if isinstance(held, PLAIN) or (isinstance(held, CODE) and not editable(str(held.__module__))):
+            self.key += [type(held), plain(held)]
             return held
         if id(held) in self._known:
             number, _, out = self._known[id(held)]
             self.key.append(("again", number))
             return out
         number = len(self._known)
-        self.key += [type(held), _code_of(type(held))]
+        self.key += [type(held), self.read.kind(type(held))]
         self.classes[type(held)] = None
         self._known[id(held)] = number, held, held
+        outer, self._owned = self._owned, self._owned or editable(str((held if isinstance(held, type) else type(held)).__module__))
         out = self._copied(held, number)
+        self._owned = outer
         self._known[id(held)] = number, held, out  # the original stays alive, so that its id is not reused
         return out
 
     def _leaf(self, values: Array) -> Any:
         """Return the nodes of some numbers."""
         leaf = len(self.values)
-        self.values.append(values.ravel())
+        self.values.append(values.flatten())  # a copy: somebody may write to the array later
         self.key += [values.shape, values.dtype.kind]
         if self.graph is None:
             return [None] * values.size
@@ -213,17 +261,20 @@ class _Reader:
             self.key.append(tuple(held))
             return {key: self.visit(part) for key, part in held.items()}
         if isinstance(held, types.FunctionType):
-            return self._function(held)
-        if not dataclasses.is_dataclass(held):
+            return self._function(held, number)
+        if not dataclasses.is_dataclass(held) or isinstance(held, type):
             self.kept.append(held)
-            self.key.append(id(held))
-            self.changeable = self.changeable or not isinstance(held, frozenset)
+            self.key += [Same(held), self.read.value(held) if self._owned else None]
+            self.changeable = self.changeable or not isinstance(held, (frozenset, type))
             return held
         self.changeable = self.changeable or not _frozen(type(held))
+        if self._owned:
+            self.read.boxes[id(held)] = held
         out = copy.copy(held)
         self._known[id(held)] = number, held, out  # before its parts, which may refer to it
-        self.key.append(tuple(vars(held)))
-        for key, part in vars(held).items():
+        fields = attributes(held)
+        self.key.append(tuple(fields))
+        for key, part in fields.items():
             object.__setattr__(out, key, self.visit(part))
         return out
 
@@ -239,17 +290,24 @@ class _Reader:
         nodes.ravel()[:] = made
         return Traced(self.graph, nodes, FLOAT, writeable=False)
 
-    def _function(self, held: types.FunctionType) -> Any:
+    def _function(self, held: types.FunctionType, number: int) -> Any:
         self.kept.append(held)
-        self.key += [held.__code__, id(held.__globals__), read_by(held)]
+        self.key += [held.__code__, Same(held.__globals__), self.read.function(held, cells=False)]
         self.classes[held] = None
+        closure = [cell for cell in held.__closure__ or () if filled(cell)]
+        copies = {id(cell): types.CellType() for cell in closure}
+        out = held
+        if self.graph is not None and (closure or held.__defaults__ or held.__kwdefaults__):
+            cells = tuple(copies.get(id(cell), cell) for cell in held.__closure__ or ())
+            out = types.FunctionType(held.__code__, held.__globals__, held.__name__, None, cells or None)
+            vars(out).update(vars(held))
+            self._known[id(held)] = number, held, out  # before its parts, among which it may be itself
         defaults, named = self.visit(held.__defaults__), self.visit(held.__kwdefaults__)
-        parts = [self.visit(cell.cell_contents) for cell in held.__closure__ or ()]
-        if self.graph is None or not (parts or defaults or named):
-            return held
-        cells = tuple(types.CellType(part) for part in parts)
-        out = types.FunctionType(held.__code__, held.__globals__, held.__name__, defaults, cells or None)
-        out.__kwdefaults__ = named
+        parts = [self.visit(cell.cell_contents) for cell in closure]
+        if out is not held:
+            out.__defaults__, out.__kwdefaults__ = defaults, named
+            for cell, part in zip(closure, parts, strict=True):
+                copies[id(cell)].cell_contents = part
         return out
 
 
@@ -257,105 +315,9 @@ def _frozen(kind: type[Any]) -> bool:
     return bool(kind.__dataclass_params__.frozen)
 
 
-class _Same:
-    """An object as part of a key: equal to itself alone, and alive as long as the key."""
-
-    def __init__(self, held: object) -> None:
-        self.held = held
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and self.held is other.held
-
-    def __hash__(self) -> int:
-        return id(self.held)
-
-
-def _named(held: object) -> Any:
-    """Return a part of a key of a plain object; numbers of numpy by their bits."""
-    if isinstance(held, np.generic):
-        return held.dtype.str, held.tobytes()
-    return id(held) if isinstance(held, (type, types.BuiltinFunctionType, np.ufunc)) else held
-
-
-def _code_of(kind: type) -> tuple[Any, ...]:
-    """Return the functions of a class and its bases, which may be replaced at run time; of somebody else's class all that these read."""
-    functions = tuple(part for base in kind.__mro__ for part in vars(base).values() if isinstance(part, types.FunctionType))
-    return functions + tuple(_values_of(base, set()) for base in kind.__mro__ if editable(base.__module__))
-
-
-def read_by(function: types.FunctionType) -> tuple[Any, ...]:
-    """Return the globals and defaults that somebody else's function reads, and so on: they may change while the process runs."""
-    return _read(function, set(), cells=False) if editable(str(function.__module__)) else ()
-
-
-def _read(function: types.FunctionType, seen: set[int], cells: bool = True) -> tuple[Any, ...]:
-    """Return the globals, defaults and cells that a function reads; without `cells`, where these are parameters."""
-    if id(function) in seen:
-        return ()
-    seen.add(id(function))
-    codes, names = [function.__code__], list[str]()
-    for code in codes:
-        names += code.co_names
-        codes += [part for part in code.co_consts if isinstance(part, types.CodeType)]
-    held = [(name, function.__globals__[name]) for name in dict.fromkeys(names) if name in function.__globals__]
-    for name, module in list(held):  # what is read of somebody's module by its name
-        if isinstance(module, types.ModuleType) and editable(module.__name__):
-            held += [(f"{name}.{part}", vars(module)[part]) for part in dict.fromkeys(names) if part in vars(module)]
-    inside = [cell.cell_contents for cell in function.__closure__ or () if cells and _filled(cell)]
-    given = [*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values(), *inside]
-    return function.__code__, *((name, _value(value, seen)) for name, value in held), *(_value(value, seen) for value in given)
-
-
-def _filled(cell: types.CellType) -> bool:
-    try:
-        return cell.cell_contents is not cell
-    except ValueError:
-        return False
-
-
-def _values_of(kind: type, seen: set[int]) -> tuple[Any, ...]:
-    """Return what the attributes of a class hold."""
-    if id(kind) in seen:
-        return ()
-    seen.add(id(kind))
-    return tuple((name, _value(part, seen)) for name, part in vars(kind).items() if not (name.startswith("__") and name.endswith("__")))
-
-
-def _value(held: object, seen: set[int]) -> Any:
-    """Return a part of a key for something that code reads by name."""
-    if isinstance(held, (staticmethod, classmethod)):
-        held = held.__func__
-    if isinstance(held, property):
-        return tuple(_value(part, seen) for part in (held.fget, held.fset) if part is not None)
-    if isinstance(held, functools.cached_property):
-        held = held.func
-    if isinstance(held, functools._lru_cache_wrapper):
-        _caches.add(held)
-        held = held.__wrapped__
-    if isinstance(held, functools.partial):
-        held = [held.func, held.args, held.keywords]
-    if isinstance(held, types.FunctionType):
-        return _read(held, seen) if editable(str(held.__module__)) else held.__code__
-    if isinstance(held, type):
-        return _values_of(held, seen) if editable(held.__module__) else _Same(held)
-    if isinstance(held, (tuple, list, dict)):
-        if id(held) in seen:  # it may hold itself
-            return "again"
-        seen.add(id(held))
-        if len(held) > MANY and not isinstance(held, dict) and all(type(part) in (int, float) for part in held):
-            return type(held), np.asarray(held).dtype.str, np.asarray(held).tobytes()
-        parts = held.items() if isinstance(held, dict) else enumerate(held)
-        return type(held), *((repr(key), _value(part, seen)) for key, part in parts)
-    if isinstance(held, np.ndarray) and held.dtype != object:
-        return held.shape, held.dtype.str, held.tobytes()
-    if isinstance(held, (set, frozenset)):
-        return type(held), *sorted(map(repr, held))
-    if isinstance(held, types.SimpleNamespace) or (editable(type(held).__module__) and hasattr(held, "__dict__")):
-        if id(held) in seen:
-            return "again"
-        seen.add(id(held))
-        return type(held), *((name, _value(part, seen)) for name, part in vars(held).items())
-    if isinstance(held, _PLAIN) or type(held) is float:
-        return type(held), repr(held) if isinstance(held, (float, complex)) else _named(held)
-    return _Same(held)
-
+def _content(box: Any) -> Any:
+    if isinstance(box, np.ndarray):
+        return box.copy() if box.flags.writeable and box.ndim else box
+    if isinstance(box, type):
+        return {name: part for name, part in vars(box).items() if not name.startswith("__")}
+    return copy.copy(box) if isinstance(box, BOXES) else attributes(box)

@@ -17,37 +17,37 @@ WIDEST = {"b": np.int64, "i": np.int64, "u": np.uint64}  # of sums of whole numb
 ON_BOOLS = {"add": "or", "mul": "and", "min": "and", "max": "or"}
 
 
-def any_of(x: Traced, axis: Axis = None, out: None = None, keepdims: bool = False) -> Traced:
+def any_of(x: Traced, axis: Axis = None, out: Array | None = None, keepdims: bool = False) -> Traced:
     """Return True where any is true."""
     return reduced(typed(x.graph, x, BOOL), "or", axis, keepdims, "write `if num.some(mask):`, or name the axis")
 
 
-def all_of(x: Traced, axis: Axis = None, out: None = None, keepdims: bool = False) -> Traced:
+def all_of(x: Traced, axis: Axis = None, out: Array | None = None, keepdims: bool = False) -> Traced:
     """Return True where all are true."""
     return reduced(typed(x.graph, x, BOOL), "and", axis, keepdims, "write `if num.every(mask):`, or name the axis")
 
 
-def largest(x: Traced, axis: Axis = None, out: None = None, keepdims: bool = False) -> Traced:
+def largest(x: Traced, axis: Axis = None, out: Array | None = None, keepdims: bool = False) -> Traced:
     """Return the largest number."""
     return reduced(x, "or" if x.dtype == BOOL else "max", axis, keepdims)
 
 
-def smallest(x: Traced, axis: Axis = None, out: None = None, keepdims: bool = False) -> Traced:
+def smallest(x: Traced, axis: Axis = None, out: Array | None = None, keepdims: bool = False) -> Traced:
     """Return the smallest number."""
     return reduced(x, "and" if x.dtype == BOOL else "min", axis, keepdims)
 
 
-def total(x: Traced, axis: Axis = None, dtype: DTypeLike | None = None, out: None = None, keepdims: bool = False) -> Traced:
+def total(x: Traced, axis: Axis = None, dtype: DTypeLike | None = None, out: Array | None = None, keepdims: bool = False) -> Traced:
     """Sum up to seven numbers along an axis; numpy's order for more depends on their layout in memory."""
     return reduced(summands(x, axis, dtype), "add", axis, keepdims)
 
 
-def product(x: Traced, axis: Axis = None, dtype: DTypeLike | None = None, out: None = None, keepdims: bool = False) -> Traced:
+def product(x: Traced, axis: Axis = None, dtype: DTypeLike | None = None, out: Array | None = None, keepdims: bool = False) -> Traced:
     """Multiply up to seven numbers along an axis."""
     return reduced(summands(x, axis, dtype), "mul", axis, keepdims)
 
 
-def mean(x: Traced, axis: Axis = None, dtype: DTypeLike | None = None, out: None = None, keepdims: bool = False) -> Array:
+def mean(x: Traced, axis: Axis = None, dtype: DTypeLike | None = None, out: Array | None = None, keepdims: bool = False) -> Array:
     """Return the mean of up to seven numbers along an axis."""
     count = math.prod(x.shape[a] for a in axes_of(x, axis, "name the axis"))
     return cast(Array, total(x, axis, dtype or (None if x.dtype.kind == "f" else FLOAT), keepdims=keepdims) / count)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import threading
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
@@ -13,7 +14,7 @@ from tailgate.engine import objects
 from tailgate.engine.agreement import Untraced, explained
 from tailgate.engine.graph import Graph
 from tailgate.engine.operations import Array
-from tailgate.engine.parameters import Parameters, Reading
+from tailgate.engine.parameters import Contents, Parameters, Reading, Snapshot
 
 if TYPE_CHECKING:
     from tailgate.engine.program import Program
@@ -40,6 +41,11 @@ class Answers:
     def fit(self, values: Sequence[Array]) -> bool:
         """Return True if these parameters give the same answers."""
         return all(self._read(*asked, values) == answer for asked, answer in zip(self._asked, self._answers, strict=True))
+
+    @property
+    def told(self) -> str:
+        """A hash of the answers."""
+        return hashlib.sha256(b"/".join(self._answers)).hexdigest()
 
     @staticmethod
     def _read(reading: Reading, nonzero: bool, values: Sequence[Array] | None = None) -> bytes:
@@ -69,6 +75,7 @@ class Remembered(Generic[T]):
         adopt : adapts cached programs to other parameter values
         difference : names what differs from the plain loop; empty if nothing does
         """
+        contents: Contents | None = None
         try:
             form = _form(begin())
             for played in (False, True):  # a step may fill caches, which then are parameters too
@@ -76,26 +83,27 @@ class Remembered(Generic[T]):
                     with np.errstate(all="ignore"):
                         play()
                 parameters = Parameters(held)
+                contents = contents or parameters.contents()
+                if parameters.unknown:
+                    return Untraced(f"somebody's code reads {parameters.unknown}: keep what changes in the state that start returns")
                 key = None if parameters.key is None else (form, parameters.key)
                 if found := self._find(key, parameters):
                     return adopt(found, parameters.values)
             first = parameters.snapshot()
             with parameters.restored():
                 made = make()
+            answers = Answers([program.trace.graph for program in made.programs])
+            told = parameters.told and parameters.told + answers.told
+            names = [f"{program.function.name}.{parameters.sources}{told}" for program in made.programs]
+            if not objects.proved(names):
+                if why := _apart(held, first, begin, play, lambda: difference(made)):
+                    _put_back(contents)
+                    return Untraced(why)
+                objects.prove(names)
         except Exception as error:  # a plug-in may raise anything when arrays are not numpy's
+            _put_back(contents)
             return Untraced(explained(error))
-        names = [f"{program.function.name}.{parameters.sources}" for program in made.programs]
-        if not objects.proved(names):
-            if differs := difference(made):
-                return Untraced(f"traced code and the plain loop differ in {differs}")
-            if first.changed(Parameters(held).snapshot()):  # once, as a cache that is filled, or in every step?
-                begin()
-                before = Parameters(held).snapshot()
-                difference(made)
-                if wrote := before.changed(Parameters(held).snapshot()):
-                    return Untraced(f"a step writes to {wrote}: keep what changes in the state that start returns")
-            objects.prove(names)
-        self._keep(key, parameters, [program.trace.graph for program in made.programs], made)
+        self._keep(key, parameters, answers, made)
         return made
 
     def _find(self, key: object, parameters: Parameters) -> T | None:
@@ -107,16 +115,36 @@ class Remembered(Generic[T]):
             self._held[key] = several  # now the most recently used
         return next((made for _, answers, made in several if answers.fit(parameters.values)), None)
 
-    def _keep(self, key: object, parameters: Parameters, graphs: Sequence[Graph], made: T) -> None:
+    def _keep(self, key: object, parameters: Parameters, answers: Answers, made: T) -> None:
         """Cache the programs of these parameters, with the answers that their graphs asked for."""
         if key is None:
             return
-        answers = Answers(graphs)
         with self._lock:
             several = self._held.pop(key, [])
             self._held[key] = [*several[1 - EACH :], (parameters, answers, made)]
             while len(self._held) > KEPT:
                 del self._held[next(iter(self._held))]
+
+
+def _put_back(contents: Contents | None) -> None:
+    """Let the plain loop begin with the objects as they were."""
+    if contents is not None:
+        contents.put_back()
+
+
+def _apart(held: object, first: Snapshot, begin: Callable[[], object], play: Callable[[], object], difference: Callable[[], str]) -> str:
+    """Return why traced code must not play: how it differs from the plain loop, or what a step writes to; empty if it may."""
+    if differs := difference():
+        return f"traced code and the plain loop differ in {differs}"
+    if first.changed(Parameters(held).snapshot()):  # once, as a cache that is filled, or in every step?
+        begin()
+        before = Parameters(held).snapshot()
+        for steps in (play, difference):  # one step and several: what is written last differs
+            with np.errstate(all="ignore"):
+                steps()
+            if wrote := before.changed(Parameters(held).snapshot()):
+                return f"a step writes to {wrote}: keep what changes in the state that start returns"
+    return ""
 
 
 def _form(state: object) -> tuple[Any, ...]:

@@ -79,6 +79,8 @@ def _elementwise(graph: Graph, ufunc: np.ufunc, arrays: list[Traced], dtype: DTy
     if any(kind not in DTYPES for kind in kinds):
         raise Untraceable(f"np.{ufunc.__name__} of {', '.join(map(str, kinds))}", "use real numbers of 32 or 64 bits")
     arrays = [typed(graph, a, kind) for a, kind in zip(arrays, kinds, strict=True)]
+    if op in ("floor", "ceil", "trunc") and kinds[0].kind != "f":
+        return arrays[0].copy()
     if kinds[0] == BOOL:
         op = ON_BOOLS.get(op, op)
     if op in ("rem", "shl", "shr"):

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import sys
+import threading
 from pathlib import Path
 
 _HERE = str(Path(__file__).parent)
 _NOBODYS = ("numpy", "contextlib", "functools")
 _OURS = ("tailgate.num", "tailgate.engine.hints", "tailgate.core.draws")  # callers of these matter: their line is the one to change
+
+
+traces = threading.local()  # `refused`: what the innermost trace of this thread refused, also where the code caught it
 
 
 class Untraceable(TypeError):
@@ -16,6 +20,8 @@ class Untraceable(TypeError):
     def __init__(self, what: str, instead: str) -> None:
         self.what, self.instead, self.place = what, instead, caller()
         super().__init__(f"{self.place}: {what}; {instead}")
+        if (refused := getattr(traces, "refused", None)) is not None:
+            refused.append(self)
 
 
 def caller() -> str:

@@ -10,11 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tailgate.base.errors import InputError
 from tailgate.base.pytree import duplicate, leaves, rebuilt
 from tailgate.core import Array, Attack, Command, Kind, View, WhiteBox, draws, no_command
 from tailgate.core.draws import Keys, Role
 from tailgate.core.loop import Loop, LoopState
-from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, raised, same
+from tailgate.engine.agreement import ROWS, TRIED, Untraced, check_open, compared, raised, same
 from tailgate.engine.cards import device
 from tailgate.engine.parameters import lifted
 from tailgate.engine.program import program_class
@@ -139,21 +140,26 @@ def commanded(loop: Loop) -> Commanded | Untraced:
     )
 
 
-def _difference(made: Commanded, batch: int = ROWS) -> str:
+def _difference(made: Commanded) -> str:
     """Play some steps under random commands in both engines; return the first difference, or nothing."""
+    return compared(lambda rows: _compared(made, rows))
+
+
+def _compared(made: Commanded, rows: list[int]) -> str | tuple[InputError, int]:
     loop, chance = made.loop, np.random.default_rng(0)
+    one = _nothing(loop, 1).target.shape[1:]
     kinds = [Kind[name.upper()] for name in loop.threat.kinds] or [Kind.NONE]
-    state = loop.start(draws.keys("tune", range(batch)))
+    state = loop.start(draws.keys("tune", rows))
     steps = Steps(made, state)
     for step in range(min(TRIED, loop.horizon)):
-        nothing = _nothing(loop, batch)
-        kind = np.where(chance.random(batch) < 0.5, chance.choice(kinds, batch), 0).astype(np.int8)
-        target = loop.brief.granted & (kind != 0)[:, None, None] & (chance.random(nothing.target.shape) < 0.5)
-        command = Command(kind, target, chance.uniform(-2.0, 2.0, nothing.value.shape))
+        drawn = (chance.random(ROWS), chance.choice(kinds, ROWS), chance.random((ROWS, *one)), chance.uniform(-2.0, 2.0, (ROWS, *one)))
+        on, which, aim, value = (x[rows] for x in drawn)  # an episode does the same without the others
+        kind = np.where(on < 0.5, which, 0).astype(np.int8)
+        command = Command(kind, loop.brief.granted & (kind != 0)[:, None, None] & (aim < 0.5), value)
         found, got = raised(lambda: loop.advance(state, command)), raised(lambda: steps.play(command))  # noqa: B023
-        if isinstance(found, str):
-            return "" if found == got else f"step {step + 1}: {found}"
-        if isinstance(got, str):
+        if isinstance(found, InputError):
+            return (found, step) if str(found) == str(got) else f"step {step + 1}: {found}"
+        if isinstance(got, InputError):
             return f"step {step + 1}: {got}"
         state, frame = found
         wanted = leaves(state) | leaves({"signals": signals_of(frame), "seen": _seen(loop, state)})
