@@ -198,7 +198,7 @@ def test_episodes_that_end_with_an_error_do_not_end_the_comparison():
     assert compared(compare) == "score, step 3" and asked == [ROWS, ROWS - 2]
     whole = InputError("score", "NaN", "a number")
     whole.rows = tuple(range(60))
-    assert "most episodes end with an error" in compared(lambda rows: (whole, 1)) and compared(lambda rows: (whole, 2)) == ""
+    assert "the errors that end most episodes" in compared(lambda rows: (whole, 1)) and compared(lambda rows: (whole, 2)) == ""
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")

@@ -47,11 +47,18 @@ class _DQN(DQN):
     def _sample_action(self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1) -> tuple[Array, Array]:
         action = self.explorer.actions(n_envs)
         if self.num_timesteps >= learning_starts:
-            rate = max(self.epsilon, 1.0 - (1.0 - self.epsilon) * self.num_timesteps / self.explore)
             assert isinstance(self._last_obs, np.ndarray)
             best, _ = self.policy.predict(self._last_obs, deterministic=True)
-            action = np.where(self.explorer.rng.random(n_envs) < rate, action, best)
+            action = np.where(self.explorer.rng.random(n_envs) < self._rate, action, best)
         return action, action
+
+    @property
+    def _rate(self) -> float:
+        return max(self.epsilon, 1.0 - (1.0 - self.epsilon) * self.num_timesteps / self.explore)
+
+    def _on_step(self) -> None:
+        super()._on_step()
+        self.logger.record("rollout/exploration_rate", self._rate)  # its own schedule is not in use
 
 
 @register("learner", "dqn")

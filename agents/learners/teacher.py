@@ -114,6 +114,9 @@ def demonstrate(seat: Seat, attack: Attack, seed: int, episodes: int) -> Demonst
     one = dataclasses.replace(seat, observation=ObservationCodec(seat.loop.brief), config={})
     played = _played(one, attack, attack.prepare(seat.loop.brief), keys)
     gained, live = played["reward"], played["live"]
+    if not played["action"][live].any():
+        kinds = ", ".join(sorted({mode.kind.name.lower() for mode in seat.action.modes[1:]}))
+        raise InputError("teacher", type(attack).__name__, f"a script that attacks here with a kind that an action has: {kinds}")
     for k in range(len(gained) - 2, -1, -1):
         gained[k] += seat.reward.gamma * gained[k + 1]
     latest = np.arange(len(gained))

@@ -136,10 +136,13 @@ class ActionCodec:
         kinds: tuple[KindName, ...] = (self.spec.kind,) if self.spec.action == "timing" else self.brief.threat.kinds
         bounds, nothing = self.brief.bounds, np.zeros(granted.shape[1])
         out = [Mode("none", Kind.NONE, np.zeros_like(granted), nothing)]
-        for suffix, target in groups:
+        for suffix, whole in groups:
             for name in kinds:
                 kind = Kind[name.upper()]
                 if EFFECTS[int(kind)].inside:  # factors on gains are no sizes of a wire
+                    continue
+                target = whole & self._open(kind, self.spec.steps)
+                if not target.any():
                     continue
                 if kind in AIRED:
                     out += [] if suffix.startswith(":") else self._aired(kind, suffix, target & receivers(self.brief))
@@ -155,7 +158,16 @@ class ActionCodec:
                 else:
                     old = kind in (Kind.DELAY, Kind.REPLAY)
                     out.append(Mode(name + suffix, kind, target, nothing + self.spec.steps * old))
+        if len(out) == 1 and self.brief.sealed.any():
+            sealed = self.brief.threat.authenticated
+            raise InputError("threat_model.authenticated", sealed, "a granted wire that a kind of attack can still change")
         return out
+
+    def _open(self, kind: Kind, age: int) -> Array:
+        """Return the wires (w,) bool on which the channel accepts a kind: an authenticated one takes no forged or too old value."""
+        effect = EFFECTS[int(kind)]
+        passes = not effect.valued or effect.over_air or effect.inside or (effect.recorded and age <= self.brief.threat.key_interval)
+        return np.ones_like(self.brief.sealed) if passes else ~self.brief.sealed
 
     def _aired(self, kind: Kind, suffix: str, target: Array) -> list[Mode]:
         """Return the modes of a kind over the air, which reaches all that a receiver reads; none where `target` has no receiver."""
@@ -204,7 +216,7 @@ class ActionCodec:
         for kind in self.carried:
             mine = (kinds == kind)[:, None, None]
             value = np.where(mine, self._sent(kind, action[:, 1:], view), value)
-            target = np.where(mine, receivers(brief) if kind in AIRED else brief.granted, target)
+            target = np.where(mine, receivers(brief) if kind in AIRED else brief.granted & self._open(kind, 0), target)
         return brief.command(on, kinds, target, value)
 
     def _changed(self, kind: Kind, last: Array, change: Array) -> Array:

@@ -171,12 +171,13 @@ class Seat:
             config["frames"] = frames
         return cls(loop, ActionCodec(action, loop.brief), ObservationCodec(loop.brief, frames), reward, config)
 
-    def card(self) -> dict[str, Any]:
-        """Return the whole configuration with its hash, which papers and rows cite."""
+    def card(self, limit: int | None = None) -> dict[str, Any]:
+        """Return the whole configuration with its hash, which papers and rows cite. limit: decisions after which a wrapper truncates."""
         from tailgate.base.version import VERSION
 
         features, actions = list(self.observation.names), [mode.name for mode in self.action.modes] if self.action.discrete else None
-        card = self.config | {"observation": features, "actions": actions, "version": VERSION, "hash": digest(self.config)}
+        config = self.config | ({} if limit is None else {"max_episode_steps": limit})
+        card = config | {"observation": features, "actions": actions, "version": VERSION, "hash": digest(config)}
         return json.loads(json.dumps(card))  # type: ignore[no-any-return]
 
     # -- playing

@@ -120,7 +120,7 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
 
     def card(self) -> dict[str, Any]:
         """Return JSON data that names this environment completely, with a hash."""
-        return self.seat.card()
+        return self.seat.card(self.horizon if self.horizon < self.seat.decisions else None)
 
     # -- episodes
 

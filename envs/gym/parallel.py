@@ -63,7 +63,7 @@ class DuelEnv(ParallelEnv[str, Array, Any]):  # type: ignore[misc]
 
     def card(self) -> dict[str, Any]:
         """Return JSON data that names this game completely, with a hash."""
-        return self.duel.card()
+        return self.duel.card(**({"max_cycles": self.max_cycles} if 0 < self.max_cycles < self.duel.seat.decisions else {}))
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None

@@ -54,7 +54,7 @@ class TailgateEnv(EnvBase):  # type: ignore[misc]
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        mask = None if mask is None or not self._begun else mask.reshape(self.batch_size)
+        mask = None if mask is None or not self._begun or (self._seed is not None and bool(mask.all())) else mask.reshape(self.batch_size)
         observation, _info = self.env.reset(seed=None if mask is not None else self._seed, mask=mask)
         if mask is None:
             self._seed, self._begun = None, True

@@ -41,12 +41,15 @@ def _keys() -> str:
 
 
 def _train(options: argparse.Namespace) -> int:
+    from tailgate.agents.learners.learning import LEARNERS
     from tailgate.training import comparison, train
 
     own_classes()
     overrides = list(options.overrides) + ([f"first_seed={options.seed}"] if options.seed is not None else [])
     config = train.load_config(options.config, overrides, options.resume)
     train.check(config)  # before a word of what is done
+    for name in {text.partition(".")[0] for text in overrides} & (set(LEARNERS) - {config.learner}):
+        tell(f"{name}: its settings are not used, the learner is {config.learner} (learner={name})")
     train.long(config)
     if options.resume:
         train.same_run(config)

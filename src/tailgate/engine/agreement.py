@@ -74,7 +74,7 @@ def compared(compare: Callable[[list[int]], str | tuple[InputError, int]]) -> st
         error, steps = answer
         rows, most = [row for i, row in enumerate(rows) if i not in error.rows], max(most, steps)
         if not error.rows or len(rows) < FEW:
-            return "" if most >= ENOUGH else f"nothing that can be told: most episodes end with an error, such as {error}"
+            return "" if most >= ENOUGH else f"the errors that end most episodes, such as {error}"
 
 
 def apart(
@@ -106,7 +106,7 @@ def apart(
             if len(kept) < FEW and number > ENOUGH:
                 return ""
             if len(kept) < FEW:
-                return f"nothing that can be told: most episodes end with an error, such as {found}"
+                return f"the errors that end most episodes, such as {found}"
             return apart(program, map_leaves(lambda leaf: leaf[kept], first), step, horizon, later)  # noqa: B023
         begun, wanted = found
         got, held = results | {name: state.get_leaf(name) for name in program.places}, leaves(begun) | dict(wanted)

@@ -64,7 +64,7 @@ def _set_back(box: Any, content: dict[str, Any]) -> None:
 
 
 class Contents(NamedTuple):
-    """What objects, containers and globals held at a time."""
+    """The content of objects, containers and globals at a time."""
 
     boxes: list[tuple[Any, Any]]
     rooms: list[tuple[dict[str, Any], str, Any]]
@@ -108,7 +108,7 @@ class Parameters:
 
     @property
     def unknown(self) -> str:
-        """What somebody's code reads and no key can tell apart, by class; empty if there is nothing."""
+        """The classes of objects that somebody's code reads and no key can tell apart; empty if there are none."""
         return ", ".join(sorted({type(one).__name__ for one in self._read.unknown}))
 
     @property

@@ -1,4 +1,4 @@
-"""What somebody's code reads by name: globals, attributes of classes and modules, closures. It may change while the process runs.
+"""The content of all that somebody's code reads by name: globals, attributes, closures. It may change while the process runs.
 
 Tailgate's own code is not looked through, because nobody edits it then.
 """

@@ -29,4 +29,13 @@ def best_of(suite: Suite, threat: dict[str, Any], outcome: str, purpose: str, wo
     if len(suite.attacks) < 2:
         return next(iter(suite.attacks), None)
     rows = run(cells_of(suite, batch=BATCH, purpose=purpose, threat=threat), workers=workers)
-    return max(suite.attacks, key=lambda attack: float(outcomes([r for r in rows if r["attack"] == attack], outcome).mean()))
+    played = [attack for attack in suite.attacks if not left_out([r for r in rows if r["attack"] == attack])]
+    return max(played, key=lambda attack: float(outcomes([r for r in rows if r["attack"] == attack], outcome).mean()), default=None)
+
+
+def left_out(rows: list[dict[str, Any]]) -> str:
+    """Return why the rows of an attack count for no comparison: it cannot be played here, or every command is refused; else nothing."""
+    done = [row for row in rows if row["status"] == "ok"]
+    if any(row["refused_commands"] for row in done) and not any(row["attack_steps"] for row in done):
+        return "each of its commands is refused: the threat model does not grant them"
+    return next((str(row["reason"]) for row in rows if row["status"] == "skipped"), "")

@@ -103,7 +103,8 @@ def _config(who: Trained) -> train.TrainConfig:
     if recorded != (spec.digest, spec.entry.version):
         meant = f"version {recorded[1]}, digest {recorded[0] or 'none'}, which is not what is here"
         raise InputError(f"{where}.defence", config.defence, meant)
-    return dataclasses.replace(config, first_seed=who.seed, seeds=1, workers=1, tensorboard=False, teacher=_teacher(record, config))
+    one = dataclasses.replace(config, first_seed=who.seed, seeds=1, workers=1, tensorboard=False)
+    return dataclasses.replace(one, device=None, teacher=_teacher(record, config))
 
 
 def _teacher(record: dict[str, Any], config: train.TrainConfig) -> str | None:

@@ -19,6 +19,7 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
 from tailgate.core.schema import as_data, canonical
 from tailgate.evaluation.baselines import BATCH, best_of
+from tailgate.evaluation.baselines import left_out as reason
 from tailgate.evaluation.baselines import outcomes as outcomes_of
 from tailgate.evaluation.cells import Cell, cell_id, cells_of, run
 from tailgate.evaluation.stats import Interval, paired_difference, paired_ratio, proportion
@@ -86,8 +87,9 @@ def compare(
         return outcomes_of([r for r in rows if r["attack"] == attack and r["defence"] == defence], outcome)
 
     # who may not look into a defence has no figures against it, which is no reason to lose the others
-    skipped = {r["attack"]: r["reason"] for r in rows if r["defence"] == defence and r["status"] == "skipped"}
-    left_out = {name: skipped[name] for name in config.white_box if name in skipped}
+    here = [r for r in rows if r["defence"] == defence]
+    reasons = {name: reason([r for r in here if r["attack"] == name]) for name in (*config.white_box, *config.rivals)}
+    left_out = {name: why for name, why in reasons.items() if why}
     built, uses = Spec("defence", defence).make(), Spec("defence", defence).entry.uses
     keys = draws.keys("report", range(config.first_episode, config.first_episode + config.episodes))
     verdicts = []
@@ -102,8 +104,8 @@ def compare(
 def _report(
     config: TrainConfig, verdicts: list[Verdict], outcomes: Callable[[str], Array], scripts: Scripts, outcome: str, left_out: dict[str, str]
 ) -> dict[str, Any]:
-    best = scripts.best
-    white_box = [name for name in config.white_box if name not in left_out]
+    best = None if scripts.best in left_out else scripts.best
+    white_box, rivals = ([name for name in some if name not in left_out] for some in (config.white_box, config.rivals))
     learned = np.array([v.learned for v in verdicts])
     yoked = np.array([v.yoked for v in verdicts])
     none = np.broadcast_to(outcomes("none"), learned.shape)
@@ -138,7 +140,7 @@ def _report(
         "made_of": scripts.made_of,
         "attacks": [{"label": label, **interval._asdict(), "note": note} for label, interval, note in items],
         "advantage": {name: interval._asdict() for name, interval in versus.items()},
-        "rivals": {name: {"outcome": mean(outcomes(name))._asdict(), "advantage": over(name)._asdict()} for name in config.rivals},
+        "rivals": {name: {"outcome": mean(outcomes(name))._asdict(), "advantage": over(name)._asdict()} for name in rivals},
         "ceilings": {
             name: {"outcome": mean(outcomes(name))._asdict(), "reached": [_reached(v.learned, outcomes(name))._asdict() for v in verdicts]}
             for name in white_box if Spec("attack", name).entry.optimal

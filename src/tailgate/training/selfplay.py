@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from tailgate.agents.learners.cem import Config
-from tailgate.agents.learners.learning import LEARNERS, Progress, learner_of
+from tailgate.agents.learners.learning import LEARNERS, Progress, check_action, learner_of
 from tailgate.agents.learners.selfplay import Learner, Played, constant, export, play
 from tailgate.agents.policy.network_policy import PolicyAttack
 from tailgate.base.errors import InputError, said
@@ -38,7 +38,7 @@ from tailgate.base.sizes import Episodes, Passes, Seeds, Steps
 from tailgate.core import Array, Attack, Count, Discount, draws, param
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import config_path
-from tailgate.core.schema import as_data, build, digest, override, read_yaml
+from tailgate.core.schema import as_data, build, digest, fields_of, override, read_yaml
 from tailgate.envs.gym.duel import Duel, Payoff
 from tailgate.estimators.challenge.steered import Steered
 from tailgate.estimators.challenge.steering import nearest
@@ -128,7 +128,11 @@ class Game:
         self.duel = Duel.make(**_seat_of(config), menu=config.menu, gamma=config.gamma, **config.payoff)
         if not self.duel.seat.road:
             raise InputError("config.scenario", config.scenario, "one with a road: outcomes are collisions")
+        check_action(config.learner, self.duel.seat)
         module = learner_of(config.learner)
+        if others := dict(config.attacker).keys() - fields_of(module.Config).keys():
+            expected = f"settings of {config.learner}, or attacker={{}} for its defaults; those of the preset are of another learner"
+            raise InputError("config.attacker", sorted(others), expected)
         self.settings = build(module.Config, dict(config.attacker), "config.attacker")
         self.settings.check()
         self.defender = build(Config, dict(config.defender), "config.defender")

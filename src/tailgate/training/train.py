@@ -40,7 +40,8 @@ ENVIRONMENT = (fields_of(ActionSpec) | fields_of(Reward) | {"frames": None}).key
 # fields that change no policy; those of CHOSEN do where the best rival teaches
 COMPARED = {"episodes", "first_episode", "white_box", "others", "workers", "device"}
 CHOSEN = {"rivals", "select_episodes", "outcome"}
-LATER = {"demonstrations", "horizon_ends"}  # fields that joined when policies had been published: they leave no mark at their defaults
+# fields that joined when policies had been published, with the values that those were trained with
+LATER: dict[str, Any] = {"demonstrations": 1024, "horizon_ends": False}
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ def load_config(source: str | None, overrides: list[str], resume: bool = False) 
     if not config.directory.is_dir():
         known = sorted(p.parent.name for p in Path(config.out).glob("*/config.json"))
         raise InputError("resume", config.name, f"the name of a run in {config.out}: {', '.join(known) or 'there is none'}")
-    return checked(override(started_with(held), overrides, TrainConfig))
+    return checked(override(LATER | started_with(held), overrides, TrainConfig))
 
 
 def _preset(source: str) -> dict[str, Any]:
@@ -143,7 +144,7 @@ def checked(data: dict[str, Any]) -> TrainConfig:
 
 def recorded(data: dict[str, Any]) -> TrainConfig:
     """Return the configuration that the record of a policy holds. Records without `horizon_ends` are of trainings that had none."""
-    return checked({"horizon_ends": False} | {key: value for key, value in data.items() if key != "class"})
+    return checked(LATER | {key: value for key, value in data.items() if key != "class"})
 
 
 def _places(learner: object) -> dict[str, Iterable[str]]:
@@ -342,7 +343,7 @@ def free_of(teacher: str | None) -> set[str]:
 def training_of(config: dict[str, Any]) -> str:
     """Return what decides the policies of a configuration, as a text that is the same for the same training in any folder."""
     free = free_of(config.get("teacher")) | {"out", "name"}
-    free |= {f.name for f in dataclasses.fields(TrainConfig) if f.name in LATER and config.get(f.name) == f.default}
+    free |= {name for name, before in LATER.items() if config.get(name, before) == before}
     return canonical({key: value for key, value in config.items() if key not in free})
 
 
@@ -359,9 +360,18 @@ def is_training(config: TrainConfig, held: Path) -> bool:
         return False
 
 
+def as_begun(config: TrainConfig, held: Path) -> TrainConfig:
+    """Return a configuration with the horizon of the run that a file holds, so that all its policies are trained alike."""
+    try:
+        before = load_json(held, strict=False)
+        return dataclasses.replace(config, horizon_ends=bool(before.get("horizon_ends", LATER["horizon_ends"])))
+    except (OSError, ValueError, AttributeError):
+        return config
+
+
 def plan_key(config: dict[str, Any]) -> str:
     """Return the training of a configuration but for the defence that it is against: what a suite's plan asks of everybody."""
-    text = training_of({key: value for key, value in config.items() if key != "defence"})
+    text = training_of({key: value for key, value in config.items() if key not in ("defence", "horizon_ends")})
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
@@ -371,7 +381,7 @@ def same_run(config: TrainConfig) -> None:
     now, blank, free = as_data(config), as_data(TrainConfig()), free_of(config.teacher) | {"steps", "name", "out"}  # it may have been moved
     try:
         before = load_json(held, strict=False)
-        pairs = {key: (before.get(key, blank[key]), now[key]) for key in now if key not in free}
+        pairs = {key: (before.get(key, LATER.get(key, blank[key])), now[key]) for key in now if key not in free}
         changed = {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
     except (OSError, ValueError, AttributeError, RecursionError) as error:
         raise InputError("resume", str(held), f"the configuration of the run ({said(error)})") from None

@@ -70,6 +70,7 @@ SPACES: dict[str, Space] = {
         "cem.rest": {"range": [0.1, 0.9]},
     },
 }
+APART = 100  # between the seed of the trials and the first one of the preset: the best of many trials was lucky with its seed
 FORMS = ("range", "log", "choices")
 JOURNAL = "journal.jsonl"
 BATCH = 256  # episodes side by side; changes no result
@@ -92,9 +93,11 @@ class Search:
 
     @property
     def trained(self) -> TrainConfig:
-        """The training of a trial: one seed, nothing that is for the comparison alone. A teacher may be the best of the rivals."""
+        """The training of a trial: a seed that the run with the best parameters does not use, and no more than the trial needs."""
         rivals = self.base.rivals if self.base.teacher is not None else ()
-        return dataclasses.replace(self.base, seeds=1, workers=1, tensorboard=False, rivals=rivals, white_box=(), others=())
+        seed = self.base.first_seed + APART
+        one = dataclasses.replace(self.base, first_seed=seed, seeds=1, workers=1, tensorboard=False)
+        return dataclasses.replace(one, rivals=rivals, white_box=(), others=())
 
     @property
     def digest(self) -> str:
