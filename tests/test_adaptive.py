@@ -9,8 +9,12 @@ from pathlib import Path
 import pytest
 
 from tailgate.base.errors import InputError
+from tailgate.base.files import write_json
 from tailgate.core.scenario import Suite, config_path, load_suite
+from tailgate.core.schema import as_data
+from tailgate.evaluation.baselines import left_out
 from tailgate.evaluation.cells import evaluate
+from tailgate.training import train as training
 from tailgate.training.adaptive import asked_of, configs_of, fitting, plan_of, train_against
 from tailgate.training.train import train
 
@@ -146,3 +150,26 @@ def test_a_defence_is_never_imported_for_training(tmp_path: Path) -> None:
     """Code is named on the command line only, and a configuration is written to disk."""
     with pytest.raises(InputError, match="registered name"):
         configs_of(SUITE, "somebody:Else", tmp_path)
+
+
+def test_a_run_of_before_the_horizon_was_an_end_goes_on_as_it_was(tmp_path: Path) -> None:
+    """Policies of one run are of one environment; a suite's plan asks for both alike."""
+    config = training.load_config("gusty", [f"out={tmp_path}", "name=old"])
+    earlier = {key: value for key, value in as_data(config).items() if key not in ("horizon_ends", "demonstrations")}
+    config.directory.mkdir()
+    write_json(config.directory / "config.json", earlier)
+    assert not training.is_training(config, config.directory / "config.json")
+    begun = training.as_begun(config, config.directory / "config.json")
+    assert not begun.horizon_ends and training.is_training(begun, config.directory / "config.json")
+    assert training.plan_key(earlier) == training.plan_key(as_data(config)) == training.plan_key(as_data(begun))
+    assert not training.load_config("gusty", [f"out={tmp_path}", "name=old"], resume=True).horizon_ends
+    training.same_run(begun)
+    with pytest.raises(InputError, match="horizon_ends"):
+        training.same_run(config)
+
+
+def test_rivals_that_cannot_act_here_are_left_out() -> None:
+    rows = [{"status": "ok", "attack_steps": 0, "refused_commands": 9, "reason": ""}, {"status": "ok", "attack_steps": 0, "refused_commands": 0, "reason": ""}]
+    assert "each of its commands is refused" in left_out(rows)
+    assert left_out([{**rows[0], "attack_steps": 1}]) == left_out(rows[1:]) == ""
+    assert left_out([{"status": "skipped", "reason": "no radar"}]) == "no radar"

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import tailgate
+from tailgate.base.errors import InputError
 from tailgate.core import Kind, Received
 from tailgate.core.channel import Channel
 from tailgate.core.scenario import load_scenario
@@ -107,3 +108,17 @@ def test_a_decision_that_is_refused_throughout_costs_the_penalty_once(interval):
     for (without, illegal), (with_it, again) in zip(*paid.values(), strict=True):
         assert illegal == again and with_it == pytest.approx(without - 0.25 * illegal, abs=1e-12)
     assert [illegal for _, illegal in paid[0.0]] == ([True] * 4 + [False] * 3 + [True] * 5 if interval == 1 else [False] + [True] * 11)
+
+
+def test_an_authenticated_wire_is_no_target():
+    """It takes no forged value, and no recorded one that is older than its key allows; every action that is open is accepted."""
+    limits = {"kinds": ["fdi", "dos_jam", "dropout", "delay"], "fdi_bound": 3.0, "onset": 1, "memory": 9, "key_interval": 3}
+    arguments = {"scenario": "gusty-stop-and-go-v0", "defence": "kf", "value": 2.0, "action": "mode", "steps": 5}
+    env = AdversaryVectorEnv(8, engine="plain", threat=limits | {"authenticated": ["position"]}, **arguments)
+    env.reset(seed=0)
+    for mode in env.seat.action.modes[1:]:
+        assert mode.target[0, :2].tolist() == [mode.name == "dropout", True], mode.name
+    _, _, _, _, info = env.step(np.arange(8) % env.single_action_space.n)
+    assert not info["illegal"].any()
+    with pytest.raises(InputError, match="authenticated"):
+        AdversaryVectorEnv(1, threat=limits | {"kinds": ["fdi"], "authenticated": ["position", "velocity"]}, **arguments)

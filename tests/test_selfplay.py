@@ -284,6 +284,7 @@ def test_a_damaged_configuration_is_one_error(text, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("wrong, words", [
+    (["learner=sac", "attacker={}"], ["learner", "action mode"]), (["learner=ppo"], ["config.attacker", "population", "attacker={}"]),
     (["defence=kf"], ["steered defence"]), (["learner=xyz"], ["learner", "cem"]), (["attacker.populations=3"], ["populations"]),
     (["menu.interval=3"], ["environment.interval"]), (["scenario=thesis-ch5-v0", "defence=chi2_dkf:eta=22.8"], ["reward"]), (["name=a/b"], ["name"]),
     (["rivals=[stealth]"], ["rivals"]), (["environment.scenario=x"], ["environment", "scenario"]), (["menu=3"], ["menu", "mapping"]),

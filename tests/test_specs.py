@@ -150,3 +150,9 @@ def test_a_vector_outside_of_the_space_is_refused(value):
 def test_the_bounds_of_a_box():
     assert in_box(np.array([1.0, -1.0, 0.0])) and in_box(np.array([1, -1])) and in_box(np.array([np.float32(1.0000001)]))
     assert not in_box(np.array([1.00001])) and not in_box(np.array(["a"])) and not in_box(np.array([None]))
+
+
+def test_a_limit_of_decisions_is_part_of_the_card():
+    """Papers cite its hash; a limit beyond the horizon changes nothing."""
+    plain, short, long = (AdversaryVectorEnv(1, scenario="braking-v0", defence="kf", max_episode_steps=most).card() for most in (None, 3, 10_000))
+    assert plain == long and plain["hash"] != short["hash"] and short["max_episode_steps"] == 3

@@ -202,3 +202,10 @@ def test_a_teacher_is_a_script_that_knows_no_more(tmp_path: Path, changes: list[
         train.train(config, lambda seed, now: None)
     assert all(word in str(error.value) for word in words)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_script_whose_kind_no_action_has_teaches_nobody() -> None:
+    """Its demonstrations would be those of rest."""
+    seat = Seat.make(**ENVIRONMENT | {"threat": {"kinds": ["dos_jam"], "budget": 20}, "value": 0.0})
+    with pytest.raises(InputError, match="with a kind that an action has: dos_jam"):
+        demonstrate(seat, attack("fdi:trigger=near,threshold=40,value=-3"), 1, 8)

@@ -61,3 +61,13 @@ def test_rollouts_reset_what_is_done(tmp_path: Any, made: Callable[..., Any]) ->
 def test_what_it_refuses(made: Callable[..., Any]) -> None:
     with pytest.raises(InputError, match="autoreset"):
         made(8, autoreset="same_step", **FOLLOWING)
+
+
+def test_a_seed_counts_although_the_reset_names_all_rows(made: Callable[..., Any]) -> None:
+    """TorchRL's own loops give a mask with every reset."""
+    env, fresh = (made(4, "tailgate/CarFollowing-v1") for _ in range(2))
+    begun = env.reset()
+    for one in (env, fresh):
+        one.set_seed(9)
+    begun["_reset"] = torch.ones(4, 1, dtype=torch.bool)
+    assert torch.equal(env.reset(begun)["observation"], fresh.reset()["observation"])

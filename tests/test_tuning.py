@@ -113,6 +113,10 @@ def test_the_objective_is_the_outcome_on_tune_seeds(straight: tuple[tuning.Searc
     assert report["best"]["value"] == max(entry["value"] for entry in report["trials"])
 
 
+def test_trials_train_on_another_seed_than_what_is_reported(straight: tuple[tuning.Search, dict[str, Any]]) -> None:
+    assert straight[0].trained.first_seed == straight[0].base.first_seed + 100
+
+
 def test_the_best_configuration_trains(straight: tuple[tuning.Search, dict[str, Any]]) -> None:
     """best.yaml is a configuration with the best trial's values in it, and everything else of the preset."""
     search, report = straight
