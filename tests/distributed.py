@@ -54,3 +54,19 @@ def random_state(model, rows=4, spread=1.0):
     prior = Prior(spread * RNG.normal(size=shape), np.broadcast_to(np.eye(model.states), (*shape, model.states)))
     y = 3.0 * RNG.normal(size=(rows, *model.C.shape[:2]))
     return prior, Received(y, np.ones(y.shape, bool), np.zeros(y.shape[:2]))
+
+
+def spd(rng, count, n, low, high):
+    """Symmetric matrices with eigenvalues 10**U(low, high), and their inverses."""
+    turn, _ = np.linalg.qr(rng.normal(size=(count, n, n)))
+    size = 10.0 ** rng.uniform(low, high, (count, 1, n))
+    return (turn * size) @ np.swapaxes(turn, 1, 2), (turn / size) @ np.swapaxes(turn, 1, 2)
+
+
+def moves(filter_, plan, model, r, accept=None):
+    """X - xb (B, N, n) of one update with the innovations r (B, N, q)."""
+    shape = (len(r), model.agents, model.states)
+    belief = filter_.start(plan, Prior(np.zeros(shape), np.zeros((*shape, model.states))))
+    every = np.ones(r.shape, bool)
+    innovation = filter_.innovation(plan, belief, Received(r, every if accept is None else accept, np.zeros(shape[:2])))
+    return filter_.update(plan, belief, innovation, every if accept is None else accept).x
