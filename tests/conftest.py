@@ -79,6 +79,22 @@ def same_tree():
     return differing
 
 
+@pytest.fixture(scope="session")
+def same_rows():
+    """Every seed's trace is its own, and the same played again in each of `parts` as among the first `count` seeds; returns those."""
+
+    def played(run, count, *parts):
+        whole = run(range(count))
+        known = [whole.trace_hash(row) for row in range(count)]
+        assert len(set(known)) == count
+        for seeds in parts:
+            some = run(seeds)
+            assert [some.trace_hash(row) for row, seed in enumerate(seeds) if seed < count] == [known[seed] for seed in seeds if seed < count], seeds
+        return whole
+
+    return played
+
+
 @pytest.fixture(scope="module")
 def compiled():
     """Attacks are played by compiled code too, however few steps: it has the bits of plain code, and costs less where it plays again."""
