@@ -46,11 +46,11 @@ ATTACK_CARD = {
 
 
 class Outline(HTMLParser):
-    """Tags with their attributes, and the text of every table row by the table's class."""
+    """Tags with their attributes, the text outside of scripts and styles, and that of every table row by the table's class."""
 
     def __init__(self, text):
         super().__init__()
-        self.tags, self.lines, self.table = [], [], None
+        self.tags, self.words, self.lines, self.table = [], [], [], None
         self.feed(text.replace("<wbr>", ""))
 
     def handle_starttag(self, tag, attrs):
@@ -61,6 +61,8 @@ class Outline(HTMLParser):
             self.lines.append([self.table, ""])
 
     def handle_data(self, data):
+        if self.tags[-1:] and self.tags[-1][0] not in ("script", "style"):
+            self.words.append(data)
         if self.lines:
             self.lines[-1][1] += " " + " ".join(data.split())
 

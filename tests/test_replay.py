@@ -5,7 +5,6 @@ import json
 import re
 import shutil
 import sys
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -23,16 +22,10 @@ from tailgate.replay.episode import episode_of
 from tailgate.replay.page import context_of, render, write_page
 from tailgate.replay.replay import Filter, choose, play
 
+from .boards import Outline
+from .replays import HOSTILE, SCENARIO
+
 ROOT = Path(__file__).parents[1]
-HOSTILE = "</script><script>document.title='owned'</script><img src=x onerror=alert(1)>&\"'\u2028"
-SCENARIO = {
-    "about": "Short, for tests.", "plant": {"name": "car_following", "gap": 20.0}, "sensor": "odometry", "controller": "acc", "horizon": 40,
-    "manoeuvre": {"name": "braking", "onset": [0.0, 1.0]},
-    "threat_model": {
-        "kinds": ["dos_jam", "dos_hold", "dropout", "fdi"], "onset": 3, "budget": 30,
-        "targets": ["position", "velocity", "leader_position", "acceleration"],
-    },
-}  # fmt: skip
 DEFENCES = ("kf", "chi2_kf:eta=9", "always_brake")
 ATTACKS = ("none", "dos_jam:start_step=20", "fdi_then_jam:start_step=10,inject=4,value=-1.5", "fdi_gaussian:start_step=5,targets=[position],sd=4")
 
@@ -233,22 +226,6 @@ def test_attacked_actuators_show_what_was_applied(pick):
     other = episode_of(play(pick("kf", "fdi_then_jam:start_step=10,inject=4,value=-1.5")))
     assert other["applied"] is not None and other["applied"] != other["control"]
     assert {wire["name"] for wire in other["wires"]} == {"position", "velocity", "leader position", "acceleration"}
-
-
-class Outline(HTMLParser):
-    """Tags with attributes, and the text outside of scripts and styles."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.tags, self.words = [], []
-        self.feed(text)
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_data(self, data):
-        if self.tags[-1:] and self.tags[-1][0] not in ("script", "style"):
-            self.words.append(data)
 
 
 def test_texts_of_the_row_stay_texts(pick):

@@ -15,6 +15,8 @@ from tailgate.replay.episode import episode_of, shown, watched
 from tailgate.replay.page import context_of, outcome, render, write_page
 from tailgate.replay.replay import Filter, choose, play
 
+from .replays import text_of, to
+
 THREAT = {"kinds": ["dos_jam", "dos_hold", "fdi"], "onset": 3}
 PLATOON = {
     "about": "Short.", "plant": {"name": "platoon", "followers": 3, "gap": 30.0}, "sensor": "platoon_sensors", "controller": "cacc", "horizon": 60,
@@ -190,16 +192,8 @@ def tab(load, pages):
     return lambda name, width=1280: load(pages[name], width)
 
 
-def _to(tab, step):
-    tab.execute_script("const s = document.getElementById('slider'); s.value = arguments[0]; s.dispatchEvent(new Event('input'))", step)
-
-
 def _look(tab, agent):
     tab.execute_script("const s = document.getElementById('agent'); s.value = arguments[0]; s.dispatchEvent(new Event('change'))", agent)
-
-
-def _text(tab, name):
-    return tab.find_element("id", name).text
 
 
 @pytest.mark.thin(3)
@@ -213,7 +207,7 @@ def test_the_page_is_quiet_and_nothing_is_cut(tab, pages, name, width, asked):
     for agent in [o.get_attribute("value") for o in page.find_elements("css selector", "#agent option")]:
         _look(page, agent)
         for step in (0, last // 2, last):
-            _to(page, step)
+            to(page, step)
     wide, room = page.execute_script("return [document.documentElement.scrollWidth, document.documentElement.clientWidth]")
     assert wide <= room <= width and page.get_log("browser") == []
     assert asked() == {pages[name].as_uri()}
@@ -233,9 +227,9 @@ def test_the_picture_and_the_words_follow_the_slider(tab):
     page = tab("platoon")
     shot = "return document.getElementById('road').toDataURL()"
     start = page.execute_script(shot)
-    _to(page, 30)
-    assert page.execute_script(shot) != start and "distance of car 2 +20 m" in _text(page, "attack")
-    assert "ALARM" in _text(page, "alarm") and "car 2" in _text(page, "alarm")
+    to(page, 30)
+    assert page.execute_script(shot) != start and "distance of car 2 +20 m" in text_of(page, "attack")
+    assert "ALARM" in text_of(page, "alarm") and "car 2" in text_of(page, "alarm")
     data = page.execute_script("return JSON.parse(document.getElementById('episode').textContent)")
     values = [o.text for o in page.find_elements("css selector", "#plot-gaps output")]
     assert [float(v) for v in values] == pytest.approx([data["string"]["gap"][i][30] for i in (1, 2, 3)], abs=0.051)

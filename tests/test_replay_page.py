@@ -9,15 +9,7 @@ from tailgate.evaluation.cells import Cell, run_cell
 from tailgate.replay.page import write_page
 from tailgate.replay.replay import play
 
-HOSTILE = "</script><script>document.title='owned'</script><img src=x onerror=alert(1)>&\"'\u2028"
-SCENARIO = {
-    "about": "Short, for tests.", "plant": {"name": "car_following", "gap": 20.0}, "sensor": "odometry", "controller": "acc", "horizon": 40,
-    "manoeuvre": {"name": "braking", "onset": [0.0, 1.0]},
-    "threat_model": {
-        "kinds": ["dos_jam", "dos_hold", "dropout", "fdi"], "onset": 3, "budget": 30,
-        "targets": ["position", "velocity", "leader_position", "acceleration"],
-    },
-}  # fmt: skip
+from .replays import HOSTILE, SCENARIO, text_of, to
 
 
 @pytest.fixture(scope="module")
@@ -39,14 +31,6 @@ def pages(tmp_path_factory):
 def tab(load, pages):
     """Loads a page at a width; logs are empty before."""
     return lambda name="attacked", width=1280: load(pages[name], width)
-
-
-def text_of(tab, element):
-    return tab.find_element("id", element).text
-
-
-def to(tab, step):
-    tab.execute_script("const s = document.getElementById('slider'); s.value = arguments[0]; s.dispatchEvent(new Event('input'))", step)
 
 
 @pytest.mark.page
