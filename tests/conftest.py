@@ -166,6 +166,16 @@ def play(loop_of, granting):
     return run
 
 
+@pytest.fixture
+def said(monkeypatch):
+    """What is written in the next pictures, as it was meant to be."""
+    from tailgate.envs.render.canvas import Canvas
+
+    words, text = [], Canvas.text
+    monkeypatch.setattr(Canvas, "text", lambda self, x, y, line, *a, **k: (words.append(line), text(self, x, y, line, *a, **k))[1])
+    return words
+
+
 @pytest.fixture(scope="session")
 def linear_model():
     """A one-agent Model from its matrices."""

@@ -3,6 +3,7 @@
 import importlib.util
 import sys
 import warnings
+from functools import partial
 
 import gymnasium
 import numpy as np
@@ -19,51 +20,17 @@ from tailgate.envs.render import canvas as render_canvas
 from tailgate.envs.render import following as render_following
 from tailgate.envs.render import picture as render
 
-HEADER = int(render_canvas.HEADER)
-LEFT_OF_LAMP = int(render_canvas.LAMP - 2 * render_canvas.LAMP_SIZE)
-BADGE = np.s_[:HEADER, int(render_canvas.BADGE[0]) : int(render_canvas.BADGE[1])]
-BUDGET = np.s_[:HEADER, int(render_canvas.BUDGET) : LEFT_OF_LAMP]
-LAMP = np.s_[:HEADER, LEFT_OF_LAMP:]
-ROAD = np.s_[HEADER : int(render_following.STRIP)]
-BELIEF = np.s_[int(render_following.STRIP) + 2 :]
-REGIONS = {"badge": BADGE, "budget": BUDGET, "lamp": LAMP, "road": ROAD, "belief": BELIEF}
+from . import pictures
+from .pictures import HEADER, differ, picture, with_estimate
+
+STRIPS = {"road": np.s_[HEADER : int(render_following.STRIP)], "belief": np.s_[int(render_following.STRIP) + 2 :]}
 ROLLS = {"scenario": "stop-and-go-v0", "defence": "kf", "viewer": "plain"}
 CRASHES = {"value": -30.0, "threat": {"onset": 1}} | ROLLS  # an unguarded filter: 30 m of false data end in a collision
 
 
-def changed(a, b):
-    """Names of the regions that differ."""
-    return {name for name, region in REGIONS.items() if (a[region] != b[region]).any()}
-
-
-@pytest.fixture
-def made():
-    """A vector environment after some quiet steps."""
-
-    def make(rows=1, steps=3, **arguments):
-        env = AdversaryVectorEnv(rows, render_mode="rgb_array", engine="plain", **(ROLLS | arguments))
-        env.reset(seed=5)
-        for _ in range(steps):
-            env.step(np.zeros(rows, np.int64))
-        return env
-
-    return make
-
-
-def picture(env, state=None, frame=None, row=0):
-    return render.plain(env.seat.loop, state or env.state, frame or env.frame, row)
-
-
-def with_command(state, kind, value=0.0):
-    last = state.channel.last
-    target = np.zeros_like(last.target)
-    target[..., :2] = kind != Kind.NONE
-    command = last._replace(kind=np.full_like(last.kind, kind), target=target, value=np.where(target, value, 0.0))
-    return state._replace(channel=state.channel._replace(last=command))
-
-
-def with_estimate(state, **leaves):
-    return state._replace(estimate=state.estimate._replace(**leaves))
+made = partial(pictures.made, **ROLLS)
+changed = partial(differ, regions=STRIPS)
+with_command = partial(pictures.with_command, at=np.s_[..., :2])
 
 
 def with_gaps(state, gap=None, rear_gap=None):
@@ -76,7 +43,7 @@ def with_gaps(state, gap=None, rear_gap=None):
     return state._replace(plant=plant)
 
 
-def test_shape_type_and_repetition(made):
+def test_shape_type_and_repetition():
     env = made()
     one = picture(env)
     assert one.shape == (render.HEIGHT, render.WIDTH, 3) and one.dtype == np.uint8
@@ -86,7 +53,7 @@ def test_shape_type_and_repetition(made):
     assert (one == picture(twin)).all()
 
 
-def test_drawing_leaves_the_state_alone(made, same_tree):
+def test_drawing_leaves_the_state_alone(same_tree):
     env = made()
     before = duplicate(env.state)
     picture(env)
@@ -100,7 +67,7 @@ def test_without_pillow_the_extra_is_named(monkeypatch):
         spec.loader.exec_module(importlib.util.module_from_spec(spec))
 
 
-def test_every_command_has_its_own_badge(made):
+def test_every_command_has_its_own_badge():
     env = made()
     pictures = [picture(env, with_command(env.state, kind, -4.0)) for kind in Kind]
     for i, one in enumerate(pictures):
@@ -112,7 +79,7 @@ def test_every_command_has_its_own_badge(made):
     assert changed(picture(env), picture(env, frame=refused)) == {"badge"}
 
 
-def test_alarm_and_mode_are_at_the_lamp(made):
+def test_alarm_and_mode_are_at_the_lamp():
     env = made()
     calm = picture(env)
     assert changed(calm, picture(env, with_estimate(env.state, alarm=np.ones((1, 1), bool)))) == {"lamp"}
@@ -124,7 +91,7 @@ def test_alarm_and_mode_are_at_the_lamp(made):
 
 
 @pytest.mark.parametrize("off", [-1e12, -3000.0, -300.0, -20.0, 5.0, 80.0, 300.0, 3000.0, 1e12])
-def test_belief_has_its_own_strip_however_wild(made, off):
+def test_belief_has_its_own_strip_however_wild(off):
     env = made()
     x = env.state.estimate.x.copy()
     x[..., 0] += off
@@ -133,14 +100,14 @@ def test_belief_has_its_own_strip_however_wild(made, off):
     assert changed(picture(env), wild) == {"belief"}
 
 
-def test_belief_is_the_gap_that_the_controller_heard(made):
+def test_belief_is_the_gap_that_the_controller_heard():
     env = made()
     wires = env.frame.wires.copy()
     wires[..., env.seat.loop.model.wires.index("leader_position")] += 30.0
     assert changed(picture(env), picture(env, frame=env.frame._replace(wires=wires))) == {"belief"}
 
 
-def test_budget_is_shown_only_where_there_is_one(made):
+def test_budget_is_shown_only_where_there_is_one():
     free, bound = made(), made(threat={"budget": 7})
     assert changed(picture(free), picture(bound)) == {"budget"}
     spent = bound.state._replace(channel=bound.state.channel._replace(used=np.array([3])))
@@ -149,7 +116,7 @@ def test_budget_is_shown_only_where_there_is_one(made):
 
 @pytest.mark.parametrize("gap", [0.01, 6.0, 14.9, 15.1, 90.0, 470.0, 5000.0])
 @pytest.mark.parametrize("rear_gap", [0.01, 3.0, 42.0, 900.0])
-def test_cars_stay_in_the_picture_or_are_said_to_be_out_of_it(made, monkeypatch, gap, rear_gap):
+def test_cars_stay_in_the_picture_or_are_said_to_be_out_of_it(monkeypatch, gap, rear_gap):
     env, words, noses = made(), [], []
     canvas = render_canvas.Canvas
     text, car = canvas.text, canvas.car
@@ -167,7 +134,7 @@ def test_scale_comes_from_a_fixed_set():
     assert scales == {render_following.AHEAD / span for span in render_following.SPANS}
 
 
-def test_no_driver_behind(made):
+def test_no_driver_behind():
     env = made(scenario="thesis-ch4-v0")
     assert picture(env).shape == (render.HEIGHT, render.WIDTH, 3)
 
@@ -189,7 +156,7 @@ def _signs(monkeypatch):
         (3.0, 3.0, True, ["COLLISION"]),
     ],
 )
-def test_collisions_are_marked(made, monkeypatch, gap, rear_gap, ended, signs):
+def test_collisions_are_marked(monkeypatch, gap, rear_gap, ended, signs):
     env, said = made(), _signs(monkeypatch)
     state = with_gaps(env.state, gap, rear_gap)
     one = picture(env, state._replace(ended=np.array([ended])))
@@ -198,7 +165,7 @@ def test_collisions_are_marked(made, monkeypatch, gap, rear_gap, ended, signs):
         assert "road" in changed(one, picture(env, with_gaps(env.state, 1.0, 1.0)))
 
 
-def test_right_after_a_reset(made):
+def test_right_after_a_reset():
     env = made(rows=2, steps=0)
     assert env.frame is None
     fresh = env.render()
@@ -236,7 +203,7 @@ def test_autoreset_shows_the_crash_then_the_new_episode(monkeypatch, autoreset):
     assert said == [] and env.render()[1].shape == new.shape
 
 
-def test_every_row_has_its_own_picture(made):
+def test_every_row_has_its_own_picture():
     env = made(rows=4, steps=0)
     env.step(np.arange(4) % env.single_action_space.n)
     pictures = env.render()

@@ -28,50 +28,27 @@ from tailgate.evaluation.cells import Cell, run_cell
 from tailgate.replay.replay import play
 from tailgate.replay.video import frames, write_video
 
+from . import pictures
+from .pictures import with_command, with_estimate
+
 ROADS = ["tailgate/CarFollowing-v0", "tailgate/RadarFollowing-v0", "tailgate/Platoon-v0", "tailgate/Highway-v0"]
 SIZES = [(480, 160), (960, 240), (1280, 360)]
 FOLLOWING, RADAR, PLATOON, HIGHWAY = ROADS
 
 
-def made(name=FOLLOWING, rows=1, steps=3, action=0, seed=5, **arguments):
+def made(name=FOLLOWING, **arguments):
     """A vector environment after some steps."""
-    defaults = gymnasium.spec(name).kwargs | ({"defence": "dkf"} if name == PLATOON else {})
-    env = AdversaryVectorEnv(rows, render_mode="rgb_array", engine="plain", **(defaults | arguments))
-    env.reset(seed=seed)
-    for _ in range(steps):
-        env.step(np.full(rows, action))
-    return env
+    return pictures.made(**(gymnasium.spec(name).kwargs | ({"defence": "dkf"} if name == PLATOON else {}) | arguments))
 
 
 def picture(env, size=None, state=None, frame=None, row=0):
     return render.draw(env.seat.loop, state or env.state, frame or env.frame, row, Viewer("highway", size))
 
 
-def with_command(env, kind, value=0.0, agents=slice(None)):
-    """The state right after a command at some agents."""
-    last = env.state.channel.last
-    target = np.zeros_like(last.target)
-    target[:, agents] = kind != Kind.NONE
-    command = last._replace(kind=np.full_like(last.kind, kind), target=target, value=np.where(target, value, 0.0))
-    return env.state._replace(channel=env.state.channel._replace(last=command))
-
-
-def with_estimate(state, **leaves):
-    return state._replace(estimate=state.estimate._replace(**leaves))
-
-
 def near(picture, colour, off=12):
     """(H, W) bool: pixels of about this colour."""
     wanted = [int(colour[i : i + 2], 16) for i in (1, 3, 5)] if isinstance(colour, str) else colour
     return (np.abs(picture.astype(int) - np.array(wanted)) < off).all(axis=2)
-
-
-@pytest.fixture
-def said(monkeypatch):
-    """What is written in the next pictures, as it was meant to be."""
-    words, text = [], render_canvas.Canvas.text
-    monkeypatch.setattr(render_canvas.Canvas, "text", lambda self, x, y, line, *a, **k: (words.append(line), text(self, x, y, line, *a, **k))[1])
-    return words
 
 
 @pytest.mark.thin(5)
@@ -178,7 +155,7 @@ def test_an_attack_an_alarm_and_a_mode_are_marked_without_colour_alone(said):
     calm = picture(env)
     for kind, words in ((Kind.FDI, "ATTACK: false data (FDI)"), (Kind.DOS_HOLD, "ATTACK: DoS hold")):
         said.clear()
-        one = picture(env, None, with_command(env, kind, -4.0))
+        one = picture(env, None, with_command(env.state, kind, -4.0))
         assert words in said and (one[60:180] != calm[60:180]).any() and near(one[60:180], render_canvas.ATTACK).any()
     assert not near(calm[60:180], render_canvas.ATTACK).any()
     said.clear()
@@ -194,7 +171,7 @@ def test_an_attack_an_alarm_and_a_mode_are_marked_without_colour_alone(said):
 def test_attack_and_alarm_stand_at_the_car_of_a_platoon(said):
     """Another car attacked, or alarming, is another picture; the bars name it."""
     env = made(PLATOON)
-    shots = [picture(env, None, with_command(env, Kind.FDI, 5.0, [i])) for i in (1, 3)]
+    shots = [picture(env, None, with_command(env.state, Kind.FDI, 5.0, np.s_[:, [i]])) for i in (1, 3)]
     assert (shots[0][60:180] != shots[1][60:180]).any() and any("of car 3" in line for line in said)
     alarms = []
     for i in (1, 3):

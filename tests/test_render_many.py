@@ -8,45 +8,17 @@ pytest.importorskip("PIL")
 
 from tailgate.base.pytree import duplicate
 from tailgate.core import Kind
-from tailgate.envs.gym.gymnasium_env import AdversaryVectorEnv
 from tailgate.envs.render import canvas as render_canvas
 from tailgate.envs.render import network as render_network
 from tailgate.envs.render import picture as render
 from tailgate.envs.render import platoon as render_platoon
 
+from .pictures import HEADER, differ, made, picture, with_command, with_estimate
+
 PLATOON = {"scenario": "platoon-braking-v0", "defence": "dkf", "viewer": "plain", "threat": {"onset": 1, "targets": ["distance", "velocity"]}}
 NETWORK = {"scenario": "thesis-ch5-v0", "defence": "dkf", "reward": "error", "threat": {"onset": 1}}
-HEADER = int(render_canvas.HEADER)
-LEFT_OF_LAMP = int(render_canvas.LAMP - 2 * render_canvas.LAMP_SIZE)
-TOP = {
-    "badge": np.s_[:HEADER, int(render_canvas.BADGE[0]) : int(render_canvas.BADGE[1])],
-    "budget": np.s_[:HEADER, int(render_canvas.BUDGET) : LEFT_OF_LAMP], "lamp": np.s_[:HEADER, LEFT_OF_LAMP:],
-}  # fmt: skip
 STRIPS = {"road": np.s_[HEADER : int(render_platoon.STRIP)], "belief": np.s_[int(render_platoon.STRIP) + 2 :]}
 HALVES = {"graph": np.s_[HEADER:, : int(render_network.SPLIT)], "bars": np.s_[HEADER:, int(render_network.SPLIT) + 2 :]}
-
-
-def _differ(a, b, regions):
-    """Names of the regions that differ."""
-    return {name for name, region in (TOP | regions).items() if (a[region] != b[region]).any()}
-
-
-def picture(env, state=None, frame=None, row=0):
-    return render.plain(env.seat.loop, state or env.state, frame or env.frame, row)
-
-
-def with_estimate(state, **leaves):
-    return state._replace(estimate=state.estimate._replace(**leaves))
-
-
-def _attacked(env, agents, value, wires=slice(None)):
-    """The state right after false data injection at these agents."""
-    last = env.state.channel.last
-    target = np.zeros_like(last.target)
-    for i in agents:
-        target[:, i, wires] = True
-    command = last._replace(kind=np.full_like(last.kind, Kind.FDI), target=target, value=np.where(target, value, 0.0))
-    return env.state._replace(channel=env.state.channel._replace(last=command))
 
 
 def _agents(state, name, rows):
@@ -56,30 +28,8 @@ def _agents(state, name, rows):
     return with_estimate(state, **{name: value})
 
 
-@pytest.fixture
-def made():
-    """A vector environment after some quiet steps."""
-
-    def make(rows=1, steps=3, **arguments):
-        env = AdversaryVectorEnv(rows, render_mode="rgb_array", engine="plain", **arguments)
-        env.reset(seed=5)
-        for _ in range(steps):
-            env.step(np.zeros(rows, np.int64))
-        return env
-
-    return make
-
-
-@pytest.fixture
-def said(monkeypatch):
-    """What is written in the next pictures."""
-    words, text = [], render_canvas.Canvas.text
-    monkeypatch.setattr(render_canvas.Canvas, "text", lambda self, x, y, line, *a, **k: (words.append(line), text(self, x, y, line, *a, **k))[1])
-    return words
-
-
 @pytest.mark.parametrize("kind", [PLATOON, NETWORK])
-def test_the_picture_of_many_agents_is_a_picture(kind, made, same_tree):
+def test_the_picture_of_many_agents_is_a_picture(kind, same_tree):
     """Shape and type, the same twice, after a reset and under attack; drawing changes nothing."""
     env = made(rows=2, steps=0, **kind)
     fresh = env.render()
@@ -92,7 +42,7 @@ def test_the_picture_of_many_agents_is_a_picture(kind, made, same_tree):
     assert not same_tree(before, env.state)
 
 
-def test_every_car_of_a_platoon_is_drawn(made, said, monkeypatch):
+def test_every_car_of_a_platoon_is_drawn(said, monkeypatch):
     """A car and its speed for each agent, a ghost for each follower, the gaps to scale from bumper to bumper, true and believed."""
     cars, car = [], render_canvas.Canvas.car
     monkeypatch.setattr(render_canvas.Canvas, "car", lambda self, *a, **k: (cars.append((a, k)), car(self, *a, **k))[1])
@@ -110,39 +60,39 @@ def test_every_car_of_a_platoon_is_drawn(made, said, monkeypatch):
         assert render_canvas.metres(gap) in said
 
 
-def test_an_attack_on_a_car_is_marked_at_the_car_and_named(made, said):
+def test_an_attack_on_a_car_is_marked_at_the_car_and_named(said):
     """Badge and road change; the badge says which wires of which cars."""
     env = made(**PLATOON)
     calm = picture(env)
     said.clear()
-    assert _differ(calm, picture(env, _attacked(env, [1, 3], 7.0, slice(1))), STRIPS) == {"badge", "road"}
+    assert differ(calm, picture(env, with_command(env.state, Kind.FDI, 7.0, np.s_[:, [1, 3], :1])), STRIPS) == {"badge", "road"}
     assert any("distance +7 m of cars 1, 3" in words for words in said)
 
 
 @pytest.mark.parametrize("kind, regions", [(PLATOON, STRIPS), (NETWORK, HALVES)])
-def test_an_alarm_stands_at_the_lamp_and_at_its_agent(kind, regions, made, said):
+def test_an_alarm_stands_at_the_lamp_and_at_its_agent(kind, regions, said):
     """Lamp, words and the agent's own mark; another agent's alarm is another picture."""
     env = made(**kind)
     calm = picture(env)
     one, two = picture(env, _agents(env.state, "alarm", [1])), picture(env, _agents(env.state, "alarm", [1, 2]))
-    assert {"lamp", next(iter(regions))} <= _differ(calm, one, regions) and _differ(one, two, regions)
+    assert {"lamp", next(iter(regions))} <= differ(calm, one, regions) and differ(one, two, regions)
     noun = "car" if kind is PLATOON else "agent"
     assert f"{noun} 1" in said and f"{noun}s 1, 2" in said
 
 
 @pytest.mark.parametrize("off", [-1e12, -300.0, -20.0, 5.0, 80.0, 3000.0, 1e12])
-def test_a_wild_belief_of_a_car_stays_in_the_lower_strip(off, made, said):
+def test_a_wild_belief_of_a_car_stays_in_the_lower_strip(off, said):
     """However far off, the picture is drawn, and what lies outside of it is said."""
     env = made(**PLATOON)
     x = env.state.estimate.x.copy()
     x[:, 2, 7] += off
     with np.errstate(all="raise"):
         wild = picture(env, with_estimate(env.state, x=x))
-    assert _differ(picture(env), wild, STRIPS) == {"belief"}
+    assert differ(picture(env), wild, STRIPS) == {"belief"}
     assert any("out of view" in words for words in said) == (abs(off) >= 3000.0 or off == -300.0)
 
 
-def test_a_collision_in_a_platoon_is_marked(made, monkeypatch):
+def test_a_collision_in_a_platoon_is_marked(monkeypatch):
     """The sign names the car that hit the one ahead."""
     signs, sign = [], render_canvas.Canvas.sign
     monkeypatch.setattr(render_canvas.Canvas, "sign", lambda self, left, top, words: (signs.append(words), sign(self, left, top, words))[1])
@@ -163,7 +113,7 @@ def test_long_platoons_fit(cars):
         assert (np.diff(place.nose) < 0.0).all() and place.length >= render_platoon.SHORTEST
 
 
-def test_a_network_is_shaded_by_its_errors(made, said):
+def test_a_network_is_shaded_by_its_errors(said):
     """Darker for larger errors, the figures beside the bars; what is attacked has a ring and a lightning."""
     greys = [int(render_network.shade(e)[1:3], 16) for e in (0.0, 1e-2, 1.0, 50.0, 1e3, 1e9, np.inf)]
     assert greys == sorted(greys, reverse=True) and len(set(greys)) >= 5
@@ -171,25 +121,26 @@ def test_a_network_is_shaded_by_its_errors(made, said):
     calm = picture(env)
     sizes = env.seat.loop.model.error(env.frame.estimate.x, env.frame.truth)[0]
     assert {render_network._short(size) for size in sizes} <= set(said)
-    assert _differ(calm, picture(env, _attacked(env, [4], -4.0)), HALVES) == {"badge", "graph", "bars"}
+    assert differ(calm, picture(env, with_command(env.state, Kind.FDI, -4.0, np.s_[:, 4])), HALVES) == {"badge", "graph", "bars"}
     x = env.frame.estimate.x.copy()
     x[:, 4] += 100.0
     worse = env.frame._replace(estimate=env.frame.estimate._replace(x=x))
-    assert _differ(calm, picture(env, frame=worse), HALVES) == {"graph", "bars"}
+    assert differ(calm, picture(env, frame=worse), HALVES) == {"graph", "bars"}
 
 
-def test_a_network_without_an_estimate_says_so(made, said):
+def test_a_network_without_an_estimate_says_so(said):
     """Right after a reset there is no error to show."""
     env = made(steps=0, **NETWORK)
     env.render()
     assert "no estimate yet" in said
 
 
-def test_the_badge_of_many_wires_is_short(made, said):
+def test_the_badge_of_many_wires_is_short(said):
     """Fourteen readings of six agents with values of their own: their number and their range, within the badge."""
     env = made(**NETWORK)
     shape = env.state.channel.last.value.shape
-    picture(env, _attacked(env, [0, 1, 2, 4, 7, 9], np.linspace(-900.0, 800.0, shape[1] * shape[2]).reshape(shape)))
+    values = np.linspace(-900.0, 800.0, shape[1] * shape[2]).reshape(shape)
+    picture(env, with_command(env.state, Kind.FDI, values, np.s_[:, [0, 1, 2, 4, 7, 9]]))
     (words,) = [line for line in said if line.startswith("adds")]
     assert words.startswith("adds 14 readings of agents 0, 1, 2, 4, 7, 9: -900 to +")
 
