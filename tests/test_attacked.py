@@ -1,6 +1,5 @@
 """A whole board by one command: played, attacked by what was trained for it, scored, with its run time."""
 
-import argparse
 import json
 from pathlib import Path
 
@@ -8,6 +7,8 @@ import pytest
 
 from tailgate.base.errors import InputError
 from tailgate.cli import board as command
+
+from .commands import ran
 
 TEXT = """about: s
 scenarios: [gusty-stop-and-go-v0]
@@ -28,10 +29,7 @@ adaptive:
 
 
 def _run(*arguments: str) -> None:
-    parser = argparse.ArgumentParser()
-    command.add(parser.add_subparsers())
-    options = parser.parse_args(["run", *arguments, "--no-replays", "--workers", "1"])
-    assert options.run(options) == 0
+    assert ran(command, "run", *arguments, "--no-replays", "--workers", "1") == 0
 
 
 def test_one_command_makes_the_whole_board(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,6 +1,5 @@
 """Rows of some defences, scored beside a board that has the others, make the board that all rows make."""
 
-import argparse
 import copy
 import dataclasses
 import json
@@ -22,6 +21,7 @@ from tailgate.evaluation.cells import cells_of, run
 from tailgate.evaluation.paired import settled
 from tailgate.evaluation.rows import encode
 
+from .commands import ran
 from .scored import BEACON, ROAD, board, cell, entry, suite
 
 Data = dict[str, Any]
@@ -297,10 +297,7 @@ TEXT = "about: s\nscenarios: [thesis-ch4-v0]\ndoses: [5]\ndefences: [none, kf, c
 
 
 def _run(*arguments: str) -> None:
-    parser = argparse.ArgumentParser()
-    command.add(parser.add_subparsers())
-    options = parser.parse_args(["run", *arguments, "--no-replays", "--unattacked", "--workers", "1"])
-    assert options.run(options) == 0
+    assert ran(command, "run", *arguments, "--no-replays", "--unattacked", "--workers", "1") == 0
 
 
 @pytest.mark.long

@@ -1,6 +1,5 @@
 """A board's figures can be checked by who has none of its rows."""
 
-import argparse
 import copy
 import dataclasses
 import json
@@ -24,6 +23,8 @@ from tailgate.evaluation.attack_list import Admitted, append
 from tailgate.evaluation.cells import cells_of, run
 from tailgate.evaluation.rows import encode
 from tailgate.site.build import build_site
+
+from .commands import ran
 
 ROOT = Path(__file__).parents[1]
 SUITE = dataclasses.replace(
@@ -241,11 +242,7 @@ def test_a_board_of_something_else_is_refused(board: Data, field: str, value: An
 
 
 def _command(*arguments: str) -> int:
-    parser = argparse.ArgumentParser()
-    command.add(parser.add_subparsers())
-    options = parser.parse_args(["check", *arguments])
-    code: int = options.run(options)
-    return code
+    return ran(command, "check", *arguments)
 
 
 def test_the_command(board: Data, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,6 +1,5 @@
 """What a board has beside the figures of its rows is still there when it is scored again."""
 
-import argparse
 import dataclasses
 import json
 from pathlib import Path
@@ -14,6 +13,8 @@ from tailgate.core.scenario import load_suite
 from tailgate.evaluation.cells import cells_of, run
 from tailgate.evaluation.rows import encode
 
+from .commands import ran
+
 Data = dict[str, Any]
 TEXT = "about: s\nscenarios: [thesis-ch4-v0]\ndoses: [5]\ndefences: [none, kf, chi2_kf]\nattacks: [none, 'fdi:value=5']\nseeds: 4\n"
 DETECTED = {"scenario": "thesis-ch4-v0", "attack": "fdi:value=5", "hours": 1.0, "threshold": 9.0, "detected": None, "delay": None}
@@ -21,10 +22,7 @@ CHECKED = {"cells": 2, "equal": 2, "differs": 0, "unchecked": 0}
 
 
 def _scored(suite: Path, out: Path) -> Data:
-    parser = argparse.ArgumentParser()
-    command.add(parser.add_subparsers())
-    options = parser.parse_args(["run", str(suite), "--out", str(out), "--score-only", "--no-replays", "--unattacked"])
-    assert options.run(options) == 0
+    assert ran(command, "run", str(suite), "--out", str(out), "--score-only", "--no-replays", "--unattacked") == 0
     held: Data = json.loads((out / "small-v0" / "board.json").read_text())
     return held
 

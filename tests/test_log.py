@@ -1,6 +1,5 @@
 """A log has the episodes as they were, labels that agree with the trace, and nothing that a suite holds out."""
 
-import argparse
 import dataclasses
 import json
 import sys
@@ -26,6 +25,8 @@ from tailgate.play.trace import rollout
 from tailgate.studies import log
 from tailgate.studies.log import write_log
 from tailgate.studies.log_card import readme, recordings_of
+
+from .commands import ran
 
 ATTACKS = ("none", "fdi:start_step=40,value=9,targets=[position]", "dropout:start_step=100", "fdi_ramp:start_step=20")
 SUITE = Suite("small", "Small.", ("thesis-ch4-v0",), (12, 30, 50), ("none", "chi2_kf"), ATTACKS, 9, held_out=("fdi_ramp",))
@@ -309,15 +310,11 @@ def test_without_pyarrow_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.
 
 def test_the_command_writes_a_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "suite.yaml").write_text("name: mine\n" + "scenarios: [thesis-ch4-v0]\ndefences: [kf]\nattacks: [fdi, dropout]\nheld_out: [dropout]\n")
-    parser = argparse.ArgumentParser()
-    command.add(parser.add_subparsers())
     arguments = ["log", "--suite", str(tmp_path / "suite.yaml"), "--out", str(tmp_path / "log"), "--episodes", "1", "--dev-episodes", "1", "--dose", "5"]
-    options = parser.parse_args(arguments)
-    assert options.run(options) == 0
+    assert ran(command, *arguments) == 0
     shown = capsys.readouterr().out
     assert "train/thesis-ch4-v0.parquet" in shown and "held out: dropout" in shown
-    options = parser.parse_args([*arguments, "--json"])
-    assert options.run(options) == 0
+    assert ran(command, *arguments, "--json") == 0
     held = json.loads(capsys.readouterr().out)
     assert held["doses"] == [5] and held["attacks"] == ["none", "fdi"] and sum(file["rows"] for file in held["files"]) == 600
 

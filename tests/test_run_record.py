@@ -1,6 +1,5 @@
 """What playing a board took is kept beside it, added up over interruptions, and moves no byte of the board."""
 
-import argparse
 import json
 import shutil
 import time
@@ -22,6 +21,8 @@ from tailgate.evaluation import cells as evaluation
 from tailgate.evaluation.attack_list import attacks_of
 from tailgate.site.build import build_site
 
+from .commands import ran
+
 SUITE = "name: mine\nscenarios: [thesis-ch4-v0]\ndoses: [12]\ndefences: [none, kf]\nattacks: [none, dropout, 'fdi:value=5']\nseeds: 3\n"
 
 
@@ -33,10 +34,7 @@ def suite(tmp_path: Path) -> Path:
 
 
 def _run(suite: Path | str, out: Path, *more: str) -> Path:
-    parser = argparse.ArgumentParser()
-    command.add(parser.add_subparsers())
-    options = parser.parse_args(["run", str(suite), "--out", str(out), "--no-replays", "--unattacked", "--workers", "1", *more])
-    assert options.run(options) == 0
+    assert ran(command, "run", str(suite), "--out", str(out), "--no-replays", "--unattacked", "--workers", "1", *more) == 0
     return out / (Path(suite).stem if str(suite).endswith(".yaml") else str(suite))
 
 

@@ -1,6 +1,5 @@
 """The standard ensemble on boards: what it finds is played, asked for before a rank, held by the board, and counted by member."""
 
-import argparse
 import dataclasses
 import json
 import lzma
@@ -34,6 +33,7 @@ from tailgate.evaluation.cells import Cell, run
 from tailgate.evaluation.rows import read_rows
 from tailgate.training.adaptive import SIZES, plan_of
 
+from .commands import ran
 from .conftest import shrink_ensemble
 
 ROOT = Path(__file__).parents[1]
@@ -53,10 +53,7 @@ adaptive: {ensemble: quick, doses: [4]}
 
 
 def _run(*arguments: str) -> None:
-    parser = argparse.ArgumentParser()
-    command.add(parser.add_subparsers())
-    options = parser.parse_args(["run", *arguments, "--no-replays", "--workers", "1"])
-    assert options.run(options) == 0
+    assert ran(command, "run", *arguments, "--no-replays", "--workers", "1") == 0
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """Submissions: rows equal to those of a defence that is played alone, mixed in secret, on seeds that nobody knew, and resumable."""
 
-import argparse
 import dataclasses
 import json
 import shutil
@@ -22,6 +21,8 @@ from tailgate.play.commanded import commanded
 from tailgate.sandbox import Isolated, digest_of, mixed, play, play_submission
 from tailgate.sandbox.source import staged
 from tailgate.sandbox.table import Seat
+
+from .commands import ran
 
 KALMAN = "tailgate.estimators:Kalman"
 SCENARIO = """
@@ -206,14 +207,10 @@ def test_the_command_writes_rows_and_prints_a_summary(
     (tmp_path / "suite.yaml").write_text("scenarios: [far.yaml]\ndoses: [6]\ndefences: [kf]\nattacks: [none]\nseeds: 9\n", encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
-    parser = argparse.ArgumentParser()
-    submit.add(parser.add_subparsers())
-    options = parser.parse_args(["submit", "own_sub:Own", "--digest"])
-    assert options.run(options) == 0
+    assert ran(submit, "submit", "own_sub:Own", "--digest") == 0
     digest = capsys.readouterr().out.strip()
     line = ["submit", "own_sub:Own", "--suite", "suite.yaml", "--out", "rows.jsonl", "--episodes", "1", "--limit", "memory=3000000000", "--json"]
-    options = parser.parse_args(line)
-    assert options.run(options) == 0
+    assert ran(submit, *line) == 0
     printed = capsys.readouterr()
     told = json.loads(printed.out)
     assert told["digest"] == digest == digest_of("own_sub") and told["rows"] == 1 and told["failed"] == 0 and told["table"][0]["n"] == 1

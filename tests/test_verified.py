@@ -1,6 +1,5 @@
 """A board says of each entry whether its rows were played again, and with what outcome."""
 
-import argparse
 import dataclasses
 import functools
 import json
@@ -21,6 +20,8 @@ from tailgate.site.build import build_site
 from tailgate.training.adaptive import asked_of
 from tailgate.training.train import TrainConfig, plan_key
 
+from .commands import ran
+
 ROOT = Path(__file__).parents[1]
 SUITE = Suite("small", "", ("thesis-ch4-v0",), (5,), ("none", "kf"), ("none", "fdi:value=5"), 4)
 BOARDS = sorted(path.parent.name for path in (ROOT / "results").glob("*/board.json*"))
@@ -32,12 +33,9 @@ def rows() -> list[dict[str, Any]]:
 
 
 def _verify(folder: Path, *arguments: str, name: str = "report") -> dict[str, Any]:
-    parser = argparse.ArgumentParser()
-    command.add(parser.add_subparsers())
     out = folder / VERIFIED / f"{name}.json"
     files = sorted(str(path) for path in folder.glob("*.jsonl"))
-    options = parser.parse_args(["verify", "--rows", *files, "--out", str(out), *arguments])
-    options.run(options)
+    ran(command, "verify", "--rows", *files, "--out", str(out), *arguments)
     held: dict[str, Any] = json.loads(out.read_text())
     return held
 

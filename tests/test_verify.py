@@ -1,6 +1,5 @@
 """A row is the same whoever plays it again, and what somebody changed in it is found."""
 
-import argparse
 import dataclasses
 import hashlib
 import json
@@ -18,6 +17,8 @@ from tailgate.evaluation import cells as evaluation
 from tailgate.evaluation.cells import Cell, cells_of, episodes_at_once, run, run_cell
 from tailgate.evaluation.rows import encode
 from tailgate.evaluation.verify import verify
+
+from .commands import ran
 
 ATTACKS = ("none", "fdi:value=5", "dropout:probability=0.5")
 SUITE = Suite("small", "", ("thesis-ch4-v0", "thesis-ch4-literal-v0"), (5,), ("kf",), ATTACKS, 3)
@@ -243,10 +244,7 @@ def test_the_sample_is_as_large_as_asked_and_is_drawn(rows: list[dict[str, Any]]
 
 
 def _command(*arguments: str) -> int:
-    parser = argparse.ArgumentParser()
-    command.add(parser.add_subparsers())
-    options = parser.parse_args(["verify", *arguments])
-    return int(options.run(options))
+    return ran(command, "verify", *arguments)
 
 
 def test_the_command_says_which_line_of_which_file_differs(rows: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
