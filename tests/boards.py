@@ -70,6 +70,25 @@ class Outline(HTMLParser):
         return [re.sub(r"\s+", " ", text).strip() for kind, text in self.lines if kind == table]
 
 
+def asks_for_nothing(outline):
+    """No element of a page asks for anything, and no style or handler hides in an attribute."""
+    for tag, attrs in outline.tags:
+        assert tag not in ("img", "iframe", "object", "embed", "base", "form")
+        assert "style" not in attrs and not any(name.startswith("on") for name in attrs)
+        for name in ("src", "srcset", "href", "action"):
+            value = attrs.get(name) or ""
+            assert not value.startswith(("http", "//")) or (tag == "a" and name == "href" and attrs["rel"] == "noopener noreferrer")
+        assert (attrs.get("href") or "").split(":")[0] != "javascript"
+
+
+def dark_and_light(tab, show):
+    """The ground follows the wish of the reader."""
+    ground = "return getComputedStyle(document.body).backgroundColor"
+    light = tab.execute_script(ground)
+    show(1280, "dark")
+    assert (light, tab.execute_script(ground)) == ("rgb(255, 255, 255)", "rgb(20, 22, 26)")
+
+
 def share(k, n=200):
     """A share of episodes with an interval (a rough one: a page only draws it)."""
     p = k / n

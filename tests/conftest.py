@@ -1,5 +1,6 @@
 """Shared builders: short scenarios, rollouts, linear models, and equality to the last bit."""
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -93,6 +94,26 @@ def same_rows():
         return whole
 
     return played
+
+
+@pytest.fixture(scope="session")
+def spoil():
+    """Writes into every array in reach that can be written."""
+
+    def write(thing, seen):
+        if id(thing) in seen:
+            return
+        seen.add(id(thing))
+        if isinstance(thing, np.ndarray) and thing.dtype != object:
+            with contextlib.suppress(ValueError):
+                thing[...] = 1
+        elif isinstance(thing, (np.ndarray, tuple, list)):
+            for part in thing.ravel().tolist() if isinstance(thing, np.ndarray) else thing:
+                write(part, seen)
+        elif isinstance(thing, dict) or hasattr(thing, "__dict__"):
+            write(list((thing if isinstance(thing, dict) else vars(thing)).values()), seen)
+
+    return lambda thing: write(thing, set())
 
 
 @pytest.fixture(scope="module")

@@ -1,9 +1,10 @@
-"""Played readings for the defences against sparse attacks."""
+"""Played readings for the defences against sparse attacks, and what a radar reads."""
 
 import numpy as np
 
-from tailgate.core import Prior, Received
+from tailgate.core import Air, Prior, Received
 from tailgate.core.draws import Role, keys
+from tailgate.envs import RadarCruise, RadarFollowing
 
 
 def play_readings(defence, model, y, mean=None, valid=None, u=None):
@@ -38,3 +39,12 @@ def dense(linear_model, rng, n=3, q=7, Q=1e-6, R=1.0):
     A = rng.normal(size=(n, n))
     A /= np.max(np.abs(np.linalg.eigvals(A)))
     return linear_model(A, rng.normal(size=(q, n)), Q * np.eye(n), R * np.eye(q))
+
+
+def sense(radar, d, rows, dv=-5.0, power=0.0, delay=0.0, seed=0, probe=True, reaction=np.inf, step=7):
+    """What the radar reads of a gap d [m] that changes by dv [m/s] in each of `rows` episodes."""
+    model = RadarFollowing().model(radar, RadarCruise())
+    truth, one = np.zeros((rows, 1, 4)), np.ones((rows, 1))
+    truth[..., 0], truth[..., 1] = d, dv
+    draws = keys("train", range(seed, seed + rows)).at(Role.SENSOR, np.full(rows, step))
+    return radar.disturbed(radar.prepare(model), truth, np.full((rows, 1), probe), draws, Air(power * one, delay * one, reaction))

@@ -23,24 +23,10 @@ SUITE = Suite("small", "", ("thesis-ch4-v0",), (5,), ("none", "kf"), ("none",), 
 
 
 class Late:
-    """A controller whose command takes two milliseconds more."""
+    """A controller or a defence whose step takes two milliseconds more."""
 
     def __init__(self, inner) -> None:
         self.inner = inner
-
-    def __getattr__(self, name):
-        return getattr(self.inner, name)
-
-    def step(self, *arguments):
-        time.sleep(0.002)
-        return self.inner.step(*arguments)
-
-
-class Slow:
-    """A defence whose step takes two milliseconds more."""
-
-    def __init__(self) -> None:
-        self.inner = Spec("defence", "kf").make()
 
     def __getattr__(self, name):
         return getattr(self.inner, name)
@@ -55,7 +41,7 @@ def test_what_is_timed_is_the_step_of_the_defence_alone() -> None:
     """Two milliseconds more in its step count, and in the controller beside it they do not."""
     place = load_scenario("thesis-ch4-v0")
     loops = {
-        "kf": (place.loop(kf := Timed(Spec("defence", "kf").make())), kf), "slow": (place.loop(slow := Timed(Slow())), slow),
+        "kf": (place.loop(kf := Timed(Spec("defence", "kf").make())), kf), "slow": (place.loop(slow := Timed(Late(Spec("defence", "kf").make()))), slow),
         "beside": (dataclasses.replace(place.loop(one := Timed(Spec("defence", "kf").make())), controller=Late(place.controller)), one),
     }  # fmt: skip
     taken = {name: min(_round(loop, timed, seed) for seed in range(2)) for name, (loop, timed) in loops.items()}

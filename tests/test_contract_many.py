@@ -103,7 +103,7 @@ def test_a_restarted_row_is_a_fresh_one(defence, place, same_tree):
 
 @pytest.mark.thin(13)
 @each
-def test_a_white_box_looks_at_will_and_writes_nothing(defence, place):
+def test_a_white_box_looks_at_will_and_writes_nothing(defence, place, spoil):
     """Playing ahead with the defence's state, then scribbling over all that a view shows, changes nothing of the episode."""
     held, batch = loop_of(place, defence), 1 if slow(defence) else 2
     loop = dataclasses.replace(held)  # what is shown is spoiled: a copy of its own, of the same plan
@@ -116,26 +116,11 @@ def test_a_white_box_looks_at_will_and_writes_nothing(defence, place):
                 received = view.received._replace(y=view.received.y + 9.0, attacked=np.zeros_like(view.received.valid))
                 box.defence.step(box.plan, box.state, received, box.known_u, draws)
             else:
-                _spoil([box.plan, box.state, view._replace(defence=None)], set())
+                spoil([box.plan, box.state, view._replace(defence=None)])
             return super().decide(plan, state, view, draws)
 
     plain, spoiled = (play(loop, attack, range(batch)) for attack in ("none", Vandal()))
     assert [plain.trace_hash(i) for i in range(batch)] == [spoiled.trace_hash(i) for i in range(batch)]
-
-
-def _spoil(thing, seen):
-    """Write into every array that can be written."""
-    if id(thing) in seen:
-        return
-    seen.add(id(thing))
-    if isinstance(thing, np.ndarray) and thing.dtype != object:
-        if thing.flags.writeable:
-            thing[...] = 1
-    elif isinstance(thing, (np.ndarray, tuple, list)):
-        for part in thing.ravel().tolist() if isinstance(thing, np.ndarray) else thing:
-            _spoil(part, seen)
-    elif isinstance(thing, dict) or hasattr(thing, "__dict__"):
-        _spoil(list((thing if isinstance(thing, dict) else vars(thing)).values()), seen)
 
 
 @pytest.mark.parametrize("attack, place", [(a, p) for p in PLACES for a in ATTACKS])

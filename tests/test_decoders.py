@@ -273,11 +273,12 @@ def test_bernoulli_without_births_is_the_kalman_filter():
             np.testing.assert_array_equal(ours.signals[name], known.signals[name], err_msg=name)
 
 
-def test_a_step_of_the_bernoulli_filter(linear_model):
-    """S0 = 2.618, S1 = 102.618, r- = 0.1: innovations 0, 2, 4, 8 give r = .0174, .0360, .2585, .9996."""
+@pytest.mark.parametrize("components", [1, 4])
+def test_a_step_of_the_bernoulli_filter(components, linear_model):
+    """S0 = 2.618, S1 = 102.618, r- = 0.1: innovations 0, 2, 4, 8 give r = .0174, .0360, .2585, .9996, whatever the number of Gaussians."""
     golden = (1.0 + 5.0**0.5) / 2.0  # P- of A = C = Q = R = 1 at rest: the prior of variance 1 grows to it
     model = linear_model([[1.0]], [[1.0]], [[golden - 1.0]], [[1.0]])
-    defence = Bernoulli(birth=0.1, survival=0.1, spread=10.0, drift=0.0)
+    defence = Bernoulli(birth=0.1, survival=0.1, spread=10.0, drift=0.0, components=components)
     for r, wanted in ((0.0, 0.0174), (2.0, 0.0360), (4.0, 0.2585), (8.0, 0.9996)):
         _, out = play_readings(defence, model, np.full((1, 1, 1), r))
         assert out[0][0].r[0, 0] == pytest.approx(wanted, abs=6e-5)

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 import tailgate
-from tailgate.core import Air
-from tailgate.core.draws import Role, keys
+from tailgate.core.draws import keys
 from tailgate.core.scenario import load_scenario
-from tailgate.envs import FmcwRadar, RadarCruise, RadarFollowing
+from tailgate.envs import FmcwRadar
 from tailgate.envs.sensors import fmcw, fmcw_signal
 from tailgate.envs.sensors.fmcw_signal import read, root_music, samples
 from tailgate.play.trace import rollout
+
+from .readings import sense
 
 LINK = fmcw.Link()
 SHARP = FmcwRadar(range_sd=1e-9, speed_sd=1e-9, reach=(1e-3, 1e6))  # the target is a point: what is left is the estimation's error
@@ -25,14 +26,6 @@ NORMAL = 3.2905  # 99.9 % two-sided
 def noise(shape, seed=0):
     pair = np.random.default_rng(seed).standard_normal((2, *shape))
     return (pair[0] + 1j * pair[1]) * np.sqrt(0.5)
-
-
-def sense(radar, d, rows, dv=-5.0, power=0.0, delay=0.0, seed=0, probe=True, reaction=np.inf):
-    model = RadarFollowing().model(radar, RadarCruise())
-    truth, one = np.zeros((rows, 1, 4)), np.ones((rows, 1))
-    truth[..., 0], truth[..., 1] = d, dv
-    draws = keys("train", range(seed, seed + rows)).at(Role.SENSOR, np.full(rows, 7))
-    return radar.disturbed(radar.prepare(model), truth, one == (1.0 if probe else 0.0), draws, Air(power * one, delay * one, reaction))
 
 
 @pytest.mark.parametrize(("d", "dv", "late"), [(100.0, 20.0, 0.0), (100.0, -20.0, 0.0), (3.0, -8.0, 0.0), (60.0, 5.0, 6.0), (200.0, 60.0, 0.0)])

@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 import tailgate
+from tailgate.agents.scripts.scripted import NoAttack
 from tailgate.base.errors import InputError
 from tailgate.core import Kind, draws, no_command
 from tailgate.core.draws import Role
@@ -57,17 +58,11 @@ def runs(name, attack, seeds, horizon=80, defence="none", **plant):
     return rollout(place.loop(tailgate.make_defence(defence)), attack, draws.keys("report", list(seeds)))
 
 
-class Adds:
+@dataclasses.dataclass(frozen=True)
+class Adds(NoAttack):
     """Adds metres to the distance that the radar reads, from the first step that is allowed."""
 
-    def __init__(self, metres):
-        self.metres = metres
-
-    def prepare(self, brief):
-        return brief
-
-    def start(self, plan, batch, draws):
-        return None
+    metres: float
 
     def decide(self, plan, state, view, draws):
         value = np.zeros((len(view.k), 1, 3))

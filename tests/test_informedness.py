@@ -18,6 +18,8 @@ from tailgate.play.trace import Trace, rollout
 from tailgate.trust.informs import INFORMS, Informed, difference, informed, informedness
 from tailgate.trust.run import check as trust
 
+pytestmark = pytest.mark.usefixtures("compiled")
+
 
 class Guesses(Detector[None, Array]):
     """Alarms in one step of eight, by a number that the step alone decides."""
@@ -43,12 +45,6 @@ class Guessing(Composed):
 
     def parts(self) -> tuple[Filter, Detector, Mitigation]:
         return KalmanFilter(), Guesses(), AcceptAll()
-
-
-@pytest.fixture(autouse=True)
-def compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Attacks are played by compiled code too, which has the bits of plain code."""
-    monkeypatch.setattr("tailgate.play.trace.MANY", 1)
 
 
 def _pairs(defence: Any, attack: str, n: int = 30) -> Informed:

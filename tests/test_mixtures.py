@@ -70,15 +70,6 @@ def test_more_gaussians_are_nearer_to_the_exact_posterior(linear_model):
     assert (off[1] < off[0]).all(), off
 
 
-def test_a_step_has_the_known_answers(linear_model):
-    """S0 = 2.618, S1 = 102.618, r- = 0.1: innovations 0, 2, 4, 8 give r = .0174, .0360, .2585, .9996, as with one Gaussian."""
-    golden = (1.0 + 5.0**0.5) / 2.0
-    model = linear_model([[1.0]], [[1.0]], [[golden - 1.0]], [[1.0]])
-    for y, wanted in ((0.0, 0.0174), (2.0, 0.0360), (4.0, 0.2585), (8.0, 0.9996)):
-        _, out = play_readings(Bernoulli(birth=0.1, survival=0.1, spread=10.0, drift=0.0, components=4), model, np.full((1, 1, 1), y))
-        assert out[0][0].r[0, 0] == pytest.approx(wanted, abs=6e-5)
-
-
 def test_without_births_it_is_the_kalman_filter(linear_model):
     """The estimates of `kf`, to rounding."""
     rng = np.random.default_rng(2)

@@ -1,7 +1,6 @@
 """(5.8): optimality over families of problems, cvxpy as the oracle, and the network of chapter 5."""
 
 import dataclasses
-import sys
 
 import numpy as np
 import pytest
@@ -253,14 +252,6 @@ def test_cvxpy_gives_the_same_estimates_in_the_loop():
         np.testing.assert_allclose(solved.estimate, exact.estimate, atol=2e-3)
         linear = rollout(place.loop(tailgate.make_defence("dkf")), rival, keys("train", [1]))
         assert np.max(np.abs(linear.estimate - exact.estimate)) > 0.1
-
-
-def test_a_missing_cvxpy_names_its_extra(monkeypatch):
-    """Asking for the solver without the package is an ImportError with the command that installs it."""
-    monkeypatch.setitem(sys.modules, "cvxpy", None)
-    with pytest.raises(ImportError, match=r"tailgate\[cvxpy\]"):
-        tailgate.make_defence("norm_resilient", solver="cvxpy")
-    tailgate.make_defence("norm_resilient")
 
 
 @pytest.mark.long

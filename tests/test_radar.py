@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 import tailgate
+from tailgate.agents.scripts.scripted import NoAttack
 from tailgate.base.errors import InputError
 from tailgate.core import Air, Kind
 from tailgate.core.draws import Role, keys
@@ -19,17 +20,11 @@ from tailgate.envs import FmcwRadar, RadarCruise, RadarFollowing
 from tailgate.envs.sensors import fmcw
 from tailgate.play.trace import rollout
 
+from .readings import sense
+
 LINK = fmcw.Link()
 SAMPLES = 25_600  # of a challenge: 0.1 s at 256 kHz
 NORMAL = 3.2905  # 99.9 % two-sided
-
-
-def sense(radar, d, rows, dv=-5.0, power=0.0, delay=0.0, probe=True, reaction=np.inf, step=7):
-    model = RadarFollowing().model(radar, RadarCruise())
-    truth, one = np.zeros((rows, 1, 4)), np.ones((rows, 1))
-    truth[..., 0], truth[..., 1] = d, dv
-    draws = keys("train", range(rows)).at(Role.SENSOR, np.full(rows, step))
-    return radar.disturbed(radar.prepare(model), truth, np.full((rows, 1), probe), draws, Air(power * one, delay * one, reaction))
 
 
 @given(st.floats(2.0, 200.0), st.floats(-60.0, 60.0))
@@ -215,13 +210,7 @@ def test_the_channel_hands_the_power_to_the_radar():
     place = load_scenario("thesis-ch3-v0")
     place = dataclasses.replace(place, horizon=30)
 
-    class Jam:
-        def prepare(self, brief):
-            return brief
-
-        def start(self, plan, batch, draws):
-            return None
-
+    class Jam(NoAttack):
         def decide(self, plan, state, view, draws):
             return None, plan.command(view.k > 15, Kind.NOISE_JAM, plan.granted, 0.1)
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import tailgate
+from tailgate.agents.scripts.scripted import NoAttack
 from tailgate.base.errors import InputError
 from tailgate.core import Command, Estimate, Kind, Mode, draws
 from tailgate.core.draws import Role
@@ -32,30 +33,19 @@ def drive(x, v, mode=Mode.NORMAL, controller=None):
     return controller.step(None, None, estimate, np.zeros((1, 1, 0)), np.array([[[0.0, v]]]))[1][0, 0, 0]
 
 
-class Late:
+@dataclasses.dataclass(frozen=True)
+class Late(NoAttack):
     """Answers the radar's echo 6 m too late from a step on."""
 
-    def __init__(self, onset=180, metres=6.0):
-        self.onset, self.metres = onset, metres
-
-    def prepare(self, brief):
-        return brief
-
-    def start(self, plan, batch, draws):
-        return None
+    onset: int = 180
+    metres: float = 6.0
 
     def decide(self, plan, state, view, draws):
         return None, plan.command(view.k >= self.onset, Kind.ECHO_DELAY, plan.granted, self.metres)
 
 
-class VeryHigh:
+class VeryHigh(NoAttack):
     """The jammer's values of the design: distance U(180, 250) m, relative speed U(0, 60) m/s, from step 182 on."""
-
-    def prepare(self, brief):
-        return brief
-
-    def start(self, plan, batch, draws):
-        return None
 
     def decide(self, plan, state, view, draws):
         u = draws.uniform((1, 2))

@@ -101,12 +101,13 @@ def test_cvxpy_gives_the_same_estimates_in_the_loop(short, play):
         assert np.max(np.abs(kf.estimate - exact.estimate)) > 1e-2
 
 
-def test_a_missing_cvxpy_names_its_extra(monkeypatch):
+@pytest.mark.parametrize("defence", ["rkf", "norm_resilient"])
+def test_a_missing_cvxpy_names_its_extra(defence, monkeypatch):
     """Asking for the solver without the package is an ImportError with the command that installs it."""
     monkeypatch.setitem(sys.modules, "cvxpy", None)
     with pytest.raises(ImportError, match=r"tailgate\[cvxpy\]"):
-        tailgate.make_defence("rkf", solver="cvxpy")
-    tailgate.make_defence("rkf")
+        tailgate.make_defence(defence, solver="cvxpy")
+    tailgate.make_defence(defence)
 
 
 @pytest.mark.parametrize("attack", ["none", "fdi", "dos_jam", "dropout"])

@@ -30,12 +30,6 @@ PLAN = {
 SMALL = Suite("small-v0", "", (ROAD,), (12,), ("none", "kf"), ("none", "fdi:value=-4"), 3, {"kinds": ["fdi"], "fdi_bound": 5.0})
 
 
-@pytest.fixture
-def compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Attacks are played by compiled code too, which has the bits of plain code."""
-    monkeypatch.setattr("tailgate.play.trace.MANY", 1)
-
-
 def test_a_knowledge_that_nobody_was_met_with_has_no_figures() -> None:
     """They would be a lower one's: where no attack knows so much, where none can look into the only defence, and where another was met."""
     where, gone = suite(attacks=("none", "fdi", "white")), {"knowledge": "white", "status": "skipped", "reason": "no look"}

@@ -8,7 +8,7 @@ from tailgate.board.words import percent
 from tailgate.site.build import build_site
 
 from . import boards
-from .boards import HOSTILE, LONG, entry, make_board
+from .boards import HOSTILE, LONG, dark_and_light, entry, make_board
 
 
 @pytest.fixture(scope="module")
@@ -213,10 +213,7 @@ def test_the_first_defence_is_seen_in_a_phone_without_scrolling(browser, single,
 @pytest.mark.page
 def test_dark_light_and_numbers(tab, show):
     """The ground follows the wish of the reader; figures stand to the right in figures of one width."""
-    ground = "return getComputedStyle(document.body).backgroundColor"
-    light = tab.execute_script(ground)
-    show(1280, "dark")
-    assert (light, tab.execute_script(ground)) == ("rgb(255, 255, 255)", "rgb(20, 22, 26)")
+    dark_and_light(tab, show)
     style = "const s = getComputedStyle(document.querySelector('.ranks td.num')); return [s.textAlign, s.fontVariantNumeric]"
     assert tab.execute_script(style) == ["right", "tabular-nums"]
 

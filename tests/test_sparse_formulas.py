@@ -26,19 +26,24 @@ RNG = np.random.default_rng(12)
 WINDOWED = ["l1_decoder", "etpg", "etpl", "l0_robust", "observer_bank:kind=gramian", "observer_bank", "kf_bank", "minimax", "bernoulli"]
 
 
-@pytest.mark.thin(3)
-@pytest.mark.parametrize("text", WINDOWED)
-def test_known_inputs_are_taken_out(linear_model, text):
-    """With inputs and a constant every estimate is that without them plus what they do to the state: by superposition."""
+def _with_inputs(linear_model, rows):
+    """A model and readings of which one sensor lies, both with inputs and a constant too, the inputs, and what they do to the state."""
     plain = dense(linear_model, RNG, n=3, q=7, Q=1e-4, R=0.01)
     driven = dataclasses.replace(plain, B=RNG.normal(size=(3, 2)), c=RNG.normal(size=3))
-    _, ys = simulated(plain, 12, 4, RNG)
-    ys[:, :, 2] += 40.0  # one sensor lies
+    _, ys = simulated(plain, 12, rows, RNG)
+    ys[:, :, 2] += 40.0
     u, xi, moved = RNG.normal(size=(12, 2)), np.zeros(3), []
     for row in u:
         xi = plain.A @ xi + driven.B @ row + driven.c
         moved.append(xi)
-    shifted = ys + (np.array(moved) @ plain.C[0].T)[:, None]
+    return (plain, ys), (driven, ys + (np.array(moved) @ plain.C[0].T)[:, None]), u, moved
+
+
+@pytest.mark.thin(3)
+@pytest.mark.parametrize("text", WINDOWED)
+def test_known_inputs_are_taken_out(linear_model, text):
+    """With inputs and a constant every estimate is that without them plus what they do to the state: by superposition."""
+    (plain, ys), (driven, shifted), u, moved = _with_inputs(linear_model, 4)
     defence = Spec("defence", text).make()
     _, without_input = play_readings(defence, plain, ys)
     _, with_input = play_readings(defence, driven, shifted, u=u)
@@ -49,17 +54,10 @@ def test_known_inputs_are_taken_out(linear_model, text):
 
 def test_the_observer_of_etpl_goes_on_with_the_known_input(linear_model):
     """After three steps of the iteration in each period its own state is that without input plus what the inputs did."""
-    plain = dense(linear_model, RNG, n=3, q=7, Q=1e-4, R=0.01)
-    driven = dataclasses.replace(plain, B=RNG.normal(size=(3, 2)), c=RNG.normal(size=3))
-    _, ys = simulated(plain, 12, 1, RNG)
-    ys[:, :, 2] += 40.0
-    u, xi, moved = RNG.normal(size=(12, 2)), np.zeros(3), []
-    for row in u:
-        xi = plain.A @ xi + driven.B @ row + driven.c
-        moved.append(xi)
+    (plain, ys), (driven, shifted), u, moved = _with_inputs(linear_model, 1)
     defence = tailgate.make_defence("etpl", rounds=3)
     plan, one = play_readings(defence, plain, ys)
-    _, other = play_readings(defence, driven, ys + (np.array(moved) @ plain.C[0].T)[:, None], u=u)
+    _, other = play_readings(defence, driven, shifted, u=u)
     for k in range(3, 12):
         off = plan.own.back[0] @ (other[k][0].own.x - one[k][0].own.x)[0, 0]
         np.testing.assert_allclose(off, moved[k - 2], rtol=0.05, atol=0.05)
