@@ -11,10 +11,11 @@ from matplotlib.patches import Circle, FancyArrowPatch
 
 from tailgate import cli
 from tailgate.base.errors import InputError
+from tailgate.core.reach import hops
 from tailgate.core.scenario import load_scenario
 from tailgate.envs import CarFollowing, Platoon, SensorNetwork
 from tailgate.envs.plants.sensor_network import THESIS_EDGES
-from tailgate.envs.render.graph import draw_graph, edges, graph_figure, hops, layout
+from tailgate.envs.render.graph import draw_graph, edges, graph_figure, layout
 
 
 def _ring(n, directed=False):

@@ -12,6 +12,7 @@ import numpy as np
 
 from tailgate import num
 from tailgate.core import AIRED, Array, Kind, Model, View
+from tailgate.core.reach import hops
 from tailgate.core.threat import Brief, receivers
 
 LIMIT = 10.0  # observations are clipped to +-LIMIT
@@ -81,13 +82,10 @@ class ObservationCodec:
     def shown(self) -> list[int]:
         """The agents with separate components: all, or of many those with the fewest hops to an attacked one."""
         model = self.brief.model
-        near, hops = set(self.victims), dict.fromkeys(self.victims, 0)
-        linked = model.graph | model.graph.T
-        while near:
-            near = {int(j) for i in near for j in np.flatnonzero(linked[i])} - hops.keys()
-            hops |= dict.fromkeys(near, 1 + max(hops.values(), default=0))
-        order = sorted(range(model.agents), key=lambda i: (hops.get(i, model.agents), i))
-        return sorted(order[:SHOWN])
+        if model.agents <= SHOWN:
+            return list(range(model.agents))
+        far = hops(model.graph)[self.victims].min(axis=0, initial=np.inf)
+        return sorted(np.argsort(far, kind="stable")[:SHOWN].tolist())
 
     @cached_property
     def spread(self) -> float:

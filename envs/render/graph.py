@@ -12,21 +12,12 @@ from tailgate.base.errors import InputError
 from tailgate.base.files import write_atomic
 from tailgate.base.plots import FORMS, canvas, drawn
 from tailgate.core import Array, Model
+from tailgate.core.reach import hops
 
 MANY = 60  # agents: more are drawn on a circle
 ROUNDS = 300  # rounds of the layout
 DPI = 160
 INK, EDGE, NODE, ATTACKED = "#1a1a1a", "#6b7076", "#dcebf5", "#b34700"
-
-
-def hops(graph: Array) -> Array:
-    """Return the edges (N, N) between two agents, whichever way they are heard; infinite where nothing joins them."""
-    linked = np.array(graph, bool) | np.array(graph, bool).T
-    count = len(linked)
-    out = np.where(np.eye(count, dtype=bool), 0.0, np.where(linked, 1.0, np.inf))
-    for k in range(count):
-        out = np.minimum(out, out[:, k, None] + out[None, k])
-    return out
 
 
 def layout(graph: Array, row: bool = False) -> Array:

@@ -17,14 +17,16 @@ SUBSETS = 5000  # most that are looked through
 MARGIN = 1e-6  # eigenvalues this close to the unit circle do not die out, and singular values this small are zero
 
 
+def hops(graph: Array, directed: bool = False) -> Array:
+    """Return the edges (N, N) between two agents, whichever way they are heard unless `directed`; infinite where nothing joins them."""
+    from scipy.sparse.csgraph import shortest_path  # takes long to import
+
+    return np.asarray(shortest_path(np.array(graph, bool), directed=directed, unweighted=True))
+
+
 def reach(graph: Array) -> Array:
     """Return (N, N) bool, [i, j] when the knowledge of j comes to i, over any number of hops; everybody reaches itself."""
-    out = np.array(graph, bool) | np.eye(len(graph), dtype=bool)
-    while True:
-        wider = np.array([np.any(out[row], axis=0) for row in out])
-        if np.array_equal(wider, out):
-            return out
-        out = wider
+    return np.isfinite(hops(graph, directed=True))
 
 
 def eigenvalues(A: Array) -> Array:

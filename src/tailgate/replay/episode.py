@@ -10,7 +10,8 @@ import numpy as np
 from tailgate.base.errors import InputError
 from tailgate.core import AIRED, Array, Kind, Mode
 from tailgate.core.kinds import EFFECTS
-from tailgate.envs.render.graph import edges, hops, layout
+from tailgate.core.reach import hops
+from tailgate.envs.render.graph import edges, layout
 
 from .replay import Replay, threshold
 
