@@ -12,7 +12,7 @@ from tailgate.core import Array, param
 from tailgate.core.draws import Draws
 from tailgate.core.quantities import Lag, Time, TimeSpan, check_order
 from tailgate.core.registry import register
-from tailgate.envs.manoeuvres import between
+from tailgate.envs.manoeuvres import Clocked, between
 
 Curvature = Annotated[float, Field(ge=-0.1, le=0.1, allow_inf_nan=False)]  # [1/m]: no road bends tighter than 10 m
 Radius = Annotated[float, Field(ge=10.0, le=1e6, allow_inf_nan=False)]  # [m]
@@ -28,7 +28,7 @@ def eased(curvature: Array, wanted: Array, most: float) -> Array:
 
 @register("manoeuvre", "bend")
 @dataclass(frozen=True)
-class Bend:
+class Bend(Clocked):
     """A straight road with one bend of constant curvature, which begins and ends at once."""
 
     curved: ClassVar[bool] = True
@@ -39,12 +39,6 @@ class Bend:
 
     def __post_init__(self) -> None:
         check_order("manoeuvre bend.begin, end", (self.begin, self.end))
-
-    def prepare(self, dt: float) -> float:
-        return dt
-
-    def start(self, plan: float, draws: Draws) -> None:
-        return None
 
     def accel(self, plan: float, state: None, k: Array, speed: Array, draws: Draws) -> tuple[None, Array]:
         """Return the curvature (B,) [1/m] after step k (B,)."""

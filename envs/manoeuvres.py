@@ -73,9 +73,19 @@ class Constant:
         return None, np.full(len(k), self.value)
 
 
+class Clocked:
+    """A manoeuvre that depends on the time alone: its plan is the step [s]."""
+
+    def prepare(self, dt: float) -> float:
+        return dt
+
+    def start(self, plan: float, draws: Draws) -> None:
+        return None
+
+
 @register("manoeuvre", "pulse", reference="Dutta 2018, section 6.6")
 @dataclass(frozen=True)
-class Pulse:
+class Pulse(Clocked):
     """A constant acceleration for some time, none before and after."""
 
     value: Accel = param(0.3, "acceleration [m/s^2]")
@@ -85,30 +95,18 @@ class Pulse:
     def __post_init__(self) -> None:
         check_order("manoeuvre pulse.begin, end", (self.begin, self.end))
 
-    def prepare(self, dt: float) -> float:
-        return dt
-
-    def start(self, plan: float, draws: Draws) -> None:
-        return None
-
     def accel(self, plan: float, state: None, k: Array, speed: Array, draws: Draws) -> tuple[None, Array]:
         return None, between(k * plan, self.begin, self.end, self.value, 0.0)
 
 
 @register("manoeuvre", "switched", reference="Dutta 2018, section 3.5.2, scenario (ii)")
 @dataclass(frozen=True)
-class Switched:
+class Switched(Clocked):
     """One constant acceleration, and from some time on another."""
 
     value: Accel = param(-0.1082, "acceleration at first [m/s^2]")
     then: Accel = param(0.012, "acceleration afterwards [m/s^2]")
     at: Time = param(100.0, "time of the switch, which the thesis does not give [s]")
-
-    def prepare(self, dt: float) -> float:
-        return dt
-
-    def start(self, plan: float, draws: Draws) -> None:
-        return None
 
     def accel(self, plan: float, state: None, k: Array, speed: Array, draws: Draws) -> tuple[None, Array]:
         return None, between(k * plan, 0.0, self.at, self.value, self.then)
