@@ -173,6 +173,23 @@ def _best(parts: list[Front], objective: Objective, slack: float) -> Front:
     return Front(*(part[rows] for part in whole))
 
 
+class Steady(NamedTuple):
+    """The Kalman filter at rest: predicted and updated covariance (n, n), innovation covariance (q, q), gain (n, q)."""
+
+    before: Array
+    after: Array
+    S: Array
+    K: Array
+
+
+def updated(before: Array, C: Array, R: Array) -> Steady:
+    """Return one measurement update of the covariance P- (n, n)."""
+    S = C @ before @ C.T + R
+    K = np.linalg.solve(S, C @ before).T
+    after = before - K @ S @ K.T
+    return Steady(before, 0.5 * (after + after.T), S, K)
+
+
 def reach(A: Array, P: Array, C: Array, R: Array, Q: Array, steps: int) -> list[Array]:
     """Return L_j = S^1/2' K' (A')^j (q, n), j = steps - 1 .. 0, of a filter with the covariance P- (n, n) at the first step.
 
@@ -180,11 +197,9 @@ def reach(A: Array, P: Array, C: Array, R: Array, Q: Array, steps: int) -> list[
     """
     moves = []
     for _ in range(steps):
-        S = C @ P @ C.T + R
-        K = np.linalg.solve(S, C @ P).T
-        moves.append(K @ np.linalg.cholesky(S))
-        after = P - K @ S @ K.T
-        P = A @ (0.5 * (after + after.T)) @ A.T + Q
+        step = updated(P, C, R)
+        moves.append(step.K @ np.linalg.cholesky(step.S))
+        P = A @ step.after @ A.T + Q
     out, power = [], np.eye(len(A))
     for move in reversed(moves):
         out.append(move.T @ power)
@@ -230,14 +245,12 @@ def stealth_programme(model: Model, P: Array, direction: Array, gate: float, bou
     a, deviation = cvxpy.Variable(size), np.zeros((model.states, size))  # what each value that is injected adds to the deviation
     limits = [a <= bound, a >= -bound]
     for k in range(steps):
-        S = C @ P @ C.T + R
-        K = np.linalg.solve(S, C @ P).T
+        step = updated(P, C, R)
         before = model.A @ deviation
         r = np.eye(size)[k * q : (k + 1) * q] - C @ before
-        limits.append(cvxpy.norm(np.linalg.inv(np.linalg.cholesky(S)) @ r @ a) <= np.sqrt(gate))
-        deviation = before + K @ r
-        after = P - K @ S @ K.T
-        P = model.A @ (0.5 * (after + after.T)) @ model.A.T + model.Q
+        limits.append(cvxpy.norm(np.linalg.inv(np.linalg.cholesky(step.S)) @ r @ a) <= np.sqrt(gate))
+        deviation = before + step.K @ r
+        P = model.A @ step.after @ model.A.T + model.Q
     problem = cvxpy.Problem(cvxpy.Maximize((direction @ deviation) @ a), limits)
     problem.solve(solver="CLARABEL")
     return float(problem.value), np.asarray(a.value).reshape(steps, q)

@@ -5,20 +5,11 @@ for tests, not part of the scored path.
 """
 
 from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
 
+from tailgate.agents.optimal.schedules import Steady, updated
 from tailgate.core import Array, Model
-
-
-class Steady(NamedTuple):
-    """The Kalman filter at rest: predicted and updated covariance (n, n), innovation covariance (q, q), gain (n, q)."""
-
-    before: Array
-    after: Array
-    S: Array
-    K: Array
 
 
 def steady_state(model: Model, agent: int = 0) -> Steady:
@@ -27,14 +18,6 @@ def steady_state(model: Model, agent: int = 0) -> Steady:
 
     C, R = model.C[agent], model.R[agent]
     return updated(solve_discrete_are(model.A.T, C.T, model.Q, R), C, R)
-
-
-def updated(before: Array, C: Array, R: Array) -> Steady:
-    """Return one measurement update of the covariance P- (n, n)."""
-    S = C @ before @ C.T + R
-    K = np.linalg.solve(S, C @ before).T
-    after = before - K @ S @ K.T
-    return Steady(before, 0.5 * (after + after.T), S, K)
 
 
 def accepted_jump(before: Array, after: Array, eta: float) -> float:

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 from scipy import special
 
+from tailgate.agents.optimal.schedules import updated
 from tailgate.core import Array, Model, Received
 from tailgate.core.scenario import load_scenario
 from tailgate.estimators.compose import AcceptAll, compose
@@ -111,7 +112,7 @@ def _theorem_3(model: Model, rng: np.random.Generator, runs: int) -> list[Claim]
     passed = int((np.linalg.norm(others.x[0], axis=1) > c * (1 + 1e-9)).sum())
     grown, P = {}, rest.after
     for k in range(1, 151):
-        step = bounds.updated(model.A @ P @ model.A.T + model.Q, model.C[0], model.R[0])
+        step = updated(model.A @ P @ model.A.T + model.Q, model.C[0], model.R[0])
         P = step.before
         if k in (1, 10, 50, 150):
             grown[f"after {k - 1} rejected samples"] = round(bounds.accepted_jump(step.before, step.after, ETA), 3)

@@ -17,6 +17,7 @@ from typing import NamedTuple, TypedDict
 
 import numpy as np
 
+from tailgate.agents.optimal.schedules import updated
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Model
 from tailgate.core.scenario import Scenario
@@ -79,12 +80,10 @@ def gains(model: Model, prior: Array, steps: int, steady: bool) -> Array:
     C, R, P = model.C[0], model.R[0], steady_state(model)[0] if steady else model.A @ prior @ model.A.T + model.Q
     out = []
     for _ in range(steps):
-        S = C @ P @ C.T + R
-        K = np.linalg.solve(S, C @ P).T
-        out.append(K)
+        step = updated(P, C, R)
+        out.append(step.K)
         if not steady:
-            after = P - K @ S @ K.T
-            P = model.A @ (0.5 * (after + after.T)) @ model.A.T + model.Q
+            P = model.A @ step.after @ model.A.T + model.Q
     return np.array(out)
 
 
