@@ -61,7 +61,7 @@ class ObserverState(NamedTuple):
     x: Array | None  # (B, N, n) the last estimate; with a window only
 
 
-def window_bank(model: Model, plan: WindowPlan, keep: Array) -> WindowBank:
+def window_bank(plan: WindowPlan, keep: Array) -> WindowBank:
     """Return the least squares of the subsets `keep` (K, q) bool, as gains on the readings of a window."""
     agents, q, T, n = plan.O.shape
     gain, after = np.zeros((agents, n, q * T, len(keep))), np.zeros((agents, len(keep), n, n))
@@ -114,7 +114,7 @@ class ObserverBank:
         if window is None:
             most, fewer = bank_plan(model, J), bank_plan(model, S)
         else:
-            most, fewer = window_bank(model, window, J), window_bank(model, window, S)
+            most, fewer = window_bank(window, J), window_bank(window, S)
         traces = [bank.after.trace(axis1=-2, axis2=-1) for bank in (most, fewer)]
         spread = np.sqrt(np.maximum(traces[1][:, inside] - traces[0][:, :, None], 0.0))
         return ObserverPlan(most, fewer, inside, spread, window)

@@ -130,11 +130,12 @@ def curves(levels: dict[str, Worst]) -> list[Data]:
 def _card(defence: str) -> Entry | None:
     """Return the card of a built-in defence. What runs somebody else's code has none, as a board must not import what a row names."""
     named = Spec("defence", defence).named()
-    return None if any(name not in _built_in(family) for family, name in named) else _built_in("defence")[named[0][1]]
+    return None if any(name not in registered(family) for family, name in named) else registered("defence")[named[0][1]]
 
 
 @functools.cache
-def _built_in(family: Family) -> dict[str, Entry]:
+def registered(family: Family) -> dict[str, Entry]:
+    """Return the built-in components of a family."""
     return built_in(family)
 
 

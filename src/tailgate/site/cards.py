@@ -12,10 +12,10 @@ from collections.abc import Mapping
 
 from tailgate.agents.policy.zoo import zoo_card, zoo_names
 from tailgate.base.reading import YAML_ENDS
+from tailgate.board.entry import registered
 from tailgate.board.schema import Data, Entry
 from tailgate.board.words import Name
-from tailgate.core.registry import Entry as Registered
-from tailgate.core.registry import Family, built_in
+from tailgate.core.registry import Family
 from tailgate.core.scenario import Suite as Played
 from tailgate.core.scenario import list_suites, load_scenario, load_suite
 from tailgate.core.threat import ThreatModel
@@ -31,11 +31,6 @@ BOUNDS = {  # of a threat model, and the kinds of attack that they bound
     "fdi_bound": {"fdi"}, "jam_range": {"dos_jam"}, "jam_power": {"noise_jam"}, "delay_bound": {"echo_delay"},
     "memory": {"delay", "replay"}, "gain_bound": {"insider"},
 }  # fmt: skip
-
-
-@functools.cache
-def _registered(family: Family) -> dict[str, Registered]:
-    return built_in(family)
 
 
 def plain(value: object) -> str:
@@ -100,7 +95,7 @@ def _training(family: Family, name: Name, suite: Played | None) -> str:
 def own_card(suite: Suite, family: Family, name: Name) -> Data:
     """Return the card of what comes with the package, from registry, file of the class and suite; empty for anything else."""
     base = "program" if name.base.endswith(YAML_ENDS) else name.base
-    entry = _registered(family).get(base)
+    entry = registered(family).get(base)
     if entry is None:
         return {}
     board = suite.board.suite

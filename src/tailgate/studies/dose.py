@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from tailgate.base import sizes
 from tailgate.base.errors import InputError
 from tailgate.core import Array
 from tailgate.core.registry import Spec
@@ -24,7 +25,7 @@ from tailgate.evaluation.cells import Cell, cells_of, run
 from tailgate.evaluation.stats import limits
 from tailgate.play.metrics import unit_in
 
-from .policies import check_episodes, is_policy, is_share, mean, misfit, outcome_for
+from .policies import is_policy, is_share, mean, misfit, outcome_for
 
 CRITICAL = 0.10  # share of episodes with damage at which a dose is critical
 RESAMPLES = 2000
@@ -86,7 +87,7 @@ def dose_response(
     outcome: a metric. exceeds: count the episodes in which it exceeds this value, instead of its mean. limit: of the mean or the share that
     makes a dose critical; 0.1 of shares, and none of means.
     """
-    check_episodes(episodes)
+    sizes.check("episodes", episodes)
     counted = outcome_for(outcome, scenario)
     if exceeds is not None and is_share(counted):
         raise InputError("exceeds", exceeds, f"nothing for {counted}, which is yes or no")

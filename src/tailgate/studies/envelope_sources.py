@@ -170,7 +170,7 @@ def _read_file(folder: Path, file: _File, signals: Signals, driver: str) -> Samp
     Raise InputError where it is not the file that schema.json describes.
     """
     pa, pq = pyarrow()
-    path, digest = folder / file.path, hashlib.sha256()
+    path = folder / file.path
     columns = [
         "attack", "episode", "k", "agent", "defence", *(f"reading_{name}" for name in signals.sensors),
         *(f"valid_{name}" for name in signals.sensors), *(f"message_{name}" for name in signals.v2v),
@@ -178,9 +178,8 @@ def _read_file(folder: Path, file: _File, signals: Signals, driver: str) -> Samp
     ]  # fmt: skip
     try:
         with path.open("rb") as content:
-            while block := content.read(1 << 20):
-                digest.update(block)
-        if digest.hexdigest() != file.sha256:
+            digest = hashlib.file_digest(content, "sha256").hexdigest()
+        if digest != file.sha256:
             raise InputError("log", str(path), "the file whose SHA-256 schema.json names: it is damaged or another one")
         table = pq.read_table(path, columns=columns, filters=[("attack", "==", "none"), ("defence", "==", driver)])
         held = {name: table[name].to_numpy() for name in columns}

@@ -310,10 +310,8 @@ def _joined(folder: Path, parts: Path, split: str, scenario: str, cells: Sequenc
                 table = held.read_row_group(i).replace_schema_metadata(None)
                 writer.write_table(table, row_group_size=table.num_rows)
                 rows, groups = rows + table.num_rows, groups + 1
-    digest = hashlib.sha256()
     with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
+        digest = hashlib.file_digest(file, "sha256")
     return {
         "path": f"{split}/{path.name}", "split": split, "scenario": scenario, "rows": rows, "row_groups": groups,
         "bytes": path.stat().st_size, "sha256": digest.hexdigest(),

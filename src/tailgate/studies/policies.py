@@ -11,7 +11,6 @@ import numpy as np
 
 from tailgate.agents.policy.network_policy import Header, PolicyAttack, load_policy
 from tailgate.agents.policy.zoo import ZooAttack
-from tailgate.base import sizes
 from tailgate.base.errors import InputError, unknown
 from tailgate.core import Array
 from tailgate.core.loop import Loop
@@ -177,11 +176,6 @@ def outcome_for(outcome: str | None, scenario: str) -> str:
     if outcome is not None:
         check_outcome("outcome", outcome)
     return outcome_of(TrainConfig(scenario=scenario, outcome=outcome))
-
-
-def check_episodes(episodes: int) -> None:
-    """Raise InputError unless there is an episode to play."""
-    sizes.check("episodes", episodes)
 
 
 def loop_for(who: Trained, scenario: str, defence: str, threat: dict[str, Any], dose: int | None = None) -> Loop:

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from tailgate.base import sizes
 from tailgate.base.errors import InputError
 from tailgate.core import Array
 from tailgate.core.registry import Spec
@@ -24,7 +25,7 @@ from tailgate.evaluation.cells import Cell, cells_of, run
 from tailgate.evaluation.stats import Interval, around, paired_difference
 from tailgate.play.metrics import unit_in
 
-from .policies import Trained, check_episodes, defence_of, distinct, is_share, mean, misfit, outcome_for, scenario_of
+from .policies import Trained, defence_of, distinct, is_share, mean, misfit, outcome_for, scenario_of
 
 LEVEL = 0.95
 T = TypeVar("T")
@@ -65,7 +66,7 @@ def transfer(
     Scenario and threat model are those of the training, which have to agree where nothing else is given. A policy that does not fit them
     (another observation or action) is skipped, with the reason.
     """
-    check_episodes(episodes)
+    sizes.check("episodes", episodes)
     members = distinct(texts)
     if not members:
         raise InputError("policies", list(texts), "at least one")

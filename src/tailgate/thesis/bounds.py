@@ -12,11 +12,11 @@ from tailgate.agents.optimal.schedules import Steady, updated
 from tailgate.core import Array, Model
 
 
-def steady_state(model: Model, agent: int = 0) -> Steady:
-    """Return the steady-state filter of one agent on its own sensors. Raises LinAlgError where none exists."""
+def steady_state(model: Model) -> Steady:
+    """Return the steady-state filter of agent 0 on its own sensors. Raises LinAlgError where none exists."""
     from scipy.linalg import solve_discrete_are  # takes long to import
 
-    C, R = model.C[agent], model.R[agent]
+    C, R = model.C[0], model.R[0]
     return updated(solve_discrete_are(model.A.T, C.T, model.Q, R), C, R)
 
 

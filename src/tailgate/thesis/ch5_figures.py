@@ -9,28 +9,20 @@ import numpy as np
 
 from tailgate.base.plots import canvas
 from tailgate.core import Array
-from tailgate.core.scenario import load_scenario
-from tailgate.envs.render.graph import graph_figure
 
 from .ch5_cases import COMPROMISED, DEFENCES, ONSET, SCENARIO, Runs
 from .claims import Drawing
-from .figures import Picture, legend_below, panel, per_agent
+from .figures import Picture, hearing, legend_below, panel, per_agent
 
 
 def cases(runs: Runs, row: int = 0) -> Iterator[Drawing]:
     """Return figures 5.1 to 5.4 of one run."""
     caption = "Figure 5.1 of the thesis again: who hears whom; agents count from 0, the compromised ones are marked."
-    yield Drawing("figure-5-1", caption, _graph)
+    yield Drawing("figure-5-1", caption, partial(hearing, SCENARIO, COMPROMISED))
     caption = f"Figure 5.2 again: attack-free, the resilient estimator, system {row}; right: the same on a logarithmic scale."
     yield Drawing("figure-5-2", caption, partial(_clean, runs["norm"][:ONSET, row]))
     caption = f"Figures 5.3 and 5.4 again: under attack after step {ONSET}, system {row}; (a): attacked."
     yield Drawing("figure-5-3-and-5-4", caption, partial(_attacked, {name: runs[name][:, row] for name in DEFENCES}))
-
-
-def _graph() -> Picture:
-    plant = load_scenario(SCENARIO).plant
-    drawn: Picture = graph_figure(plant.hears(), [str(i) for i in range(plant.agents)], attacked=COMPROMISED)
-    return drawn
 
 
 def _clean(error: Array) -> Picture:

@@ -7,30 +7,23 @@ from functools import partial
 
 from tailgate.base.plots import canvas
 from tailgate.core import Array
-from tailgate.core.scenario import load_scenario
-from tailgate.envs.render.graph import graph_figure
 
 from .ch6_cases import CASES, DEFENCES, ONSET, SCENARIO, VICTIM, Runs
 from .claims import Drawing
-from .figures import STYLES, Picture, legend_below, mark, panel, per_agent
+from .figures import STYLES, Picture, hearing, legend_below, mark, panel, per_agent
 
 NUMBERS = {"dos": "6.4", "fdi": "6.5"}
 
 
 def cases(runs: Runs, row: int = 0) -> Iterator[Drawing]:
     """Return figures 6.2 to 6.5 of one run."""
-    yield Drawing("figure-6-2", "Figure 6.2 again: who hears whom in the platoon; 0 is the leader, car 2 is attacked.", _graph)
+    caption = "Figure 6.2 again: who hears whom in the platoon; 0 is the leader, car 2 is attacked."
+    yield Drawing("figure-6-2", caption, partial(hearing, SCENARIO, (VICTIM,)))
     caption = f"Figure 6.3 again: attack-free, the resilient estimator, each car's own distance, seed {row}."
     yield Drawing("figure-6-3", caption, partial(_clean, runs["clean", "lasso"].own[:, row]))
     for case, printed in NUMBERS.items():
         caption = f"Figure {printed} again: {CASES[case][0]}, seed {row}. Bands: attacked steps; {ONSET} s before the first."
         yield Drawing(f"figure-{printed.replace('.', '-')}", caption, partial(_attacked, runs, case, row))
-
-
-def _graph() -> Picture:
-    plant = load_scenario(SCENARIO).plant
-    drawn: Picture = graph_figure(plant.hears(), [str(i) for i in range(plant.size[0])], attacked=(VICTIM,))
-    return drawn
 
 
 def _clean(own: Array) -> Picture:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
 from tailgate.core import Array
+from tailgate.core.scenario import load_scenario
+from tailgate.envs.render.graph import graph_figure
 
 if TYPE_CHECKING:
     from matplotlib import axes as axes_
@@ -28,6 +30,13 @@ def panel(ax: Axes, legend: int | None = 8, grid: Literal["major", "both"] = "ma
     ax.grid(alpha=0.3, which=grid)
     if legend is not None:
         ax.legend(fontsize=legend)
+
+
+def hearing(scenario: str, attacked: Collection[int]) -> Picture:
+    """Return the drawing of who hears whom in a scenario, the attacked agents marked."""
+    heard = load_scenario(scenario).plant.hears()
+    drawn: Picture = graph_figure(heard, [str(i) for i in range(len(heard))], attacked=attacked)
+    return drawn
 
 
 def per_agent(ax: Axes, values: Array, names: Sequence[str], agents: Iterable[int]) -> None:

@@ -170,14 +170,15 @@ def network_of(data: dict[str, Any]) -> Network:
     where = f"automata {data.get('name', '')}".strip()
     if "kind" in data:
         raise InputError(f"{where}.kind", data["kind"], "no kind: this is read as timed automata; tailgate trust --automata reads ctmc")
-    components = tuple(_component(held, f"{where}: component {i}") for i, held in enumerate(_list(data, "components", where), start=1))
-    queries = tuple(build(Query, held, f"{where}: query {i}") for i, held in enumerate(_list(data, "queries", where), start=1))
+    components = tuple(_component(held, f"{where}: component {i}") for i, held in enumerate(listed(data, "components", where), start=1))
+    queries = tuple(build(Query, held, f"{where}: query {i}") for i, held in enumerate(listed(data, "queries", where), start=1))
     network = build(Network, data | {"components": components, "queries": queries}, where)
     check(network)
     return network
 
 
-def _list(data: dict[str, Any], key: str, where: str) -> list[dict[str, Any]]:
+def listed(data: dict[str, Any], key: str, where: str) -> list[dict[str, Any]]:
+    """Return the mappings under a key, none where it is missing. Raise InputError for anything else."""
     held = data.get(key, [])
     if not isinstance(held, list) or not all(isinstance(part, dict) for part in held):
         raise InputError(f"{where}.{key}", held, "a list of mappings")
@@ -190,7 +191,7 @@ def _component(data: dict[str, Any], where: str) -> Component:
     if not isinstance(given, dict) or not all(isinstance(held, dict) for held in given.values()):
         raise InputError(f"{where}.locations", given, "a mapping of names to fields")
     locations = tuple(build(Location, {"name": name} | held, f"{where}, location {name}") for name, held in given.items())
-    edges = tuple(build(Edge, held, f"{where}, edge {i}") for i, held in enumerate(_list(data, "edges", where), start=1))
+    edges = tuple(build(Edge, held, f"{where}, edge {i}") for i, held in enumerate(listed(data, "edges", where), start=1))
     return build(Component, data | {"locations": locations, "edges": edges}, where)
 
 

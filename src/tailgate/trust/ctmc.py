@@ -19,7 +19,7 @@ from tailgate.base.errors import InputError, NotApplicable, by_name, unknown
 from tailgate.core import Array, NonNegative, Positive, param
 from tailgate.core.scenario import config_path
 from tailgate.core.schema import build, read_yaml
-from tailgate.trust.automata import NAME, Atom, Component, Edge, Location, Network, Query, check
+from tailgate.trust.automata import NAME, Atom, Component, Edge, Location, Network, Query, check, listed
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -96,10 +96,7 @@ def architecture_of(data: dict[str, Any]) -> Architecture:
     if data.get("kind") != "ctmc":
         raise InputError(f"{where}.kind", data.get("kind"), "ctmc; a network of timed automata has no kind, and is simulated")
     for key, one, cls in (("nodes", "node", Node), ("messages", "message", Route), ("queries", "query", Asked)):
-        held = data.get(key, [])
-        if not isinstance(held, list) or not all(isinstance(part, dict) for part in held):
-            raise InputError(f"{where}.{key}", held, "a list of mappings")
-        data = data | {key: tuple(build(cls, part, f"{where}: {one} {i}") for i, part in enumerate(held, start=1))}
+        data = data | {key: tuple(build(cls, part, f"{where}: {one} {i}") for i, part in enumerate(listed(data, key, where), start=1))}
     made: Architecture = build(Architecture, data, where)
     _check(made, where)
     return made

@@ -15,20 +15,16 @@ import numpy as np
 
 from tailgate.base.errors import InputError
 from tailgate.core import Array
-from tailgate.evaluation.stats import Interval, limits, proportion
+from tailgate.evaluation.stats import limits, proportion
 
 MOST = 1_000_000  # runs of a rule that stops by itself
+interval = proportion
 
 
 def _share(field: str, value: float) -> float:
     if not 0.0 < value < 1.0:
         raise InputError(field, value, "a number above 0 and below 1")
     return value
-
-
-def interval(k: int, n: int, level: float = 0.95) -> Interval:
-    """Return share of k in n with the two-sided Clopper-Pearson interval."""
-    return proportion(k, n, level)
 
 
 def lower(k: int, n: int, alpha: float) -> float:
