@@ -15,13 +15,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from tailgate import num
 from tailgate.base.errors import NotApplicable
+from tailgate.base.extras import optional
 from tailgate.core import Array, Model
 from tailgate.core.threat import ThreatModel
 
@@ -236,10 +236,7 @@ def stealth_programme(model: Model, P: Array, direction: Array, gate: float, bou
     The bound is on the injected value, not on the innovation: r_k = a_k - C A d_(k-1) for a deviation d. It ties the steps together.
     P (n, n) is the predicted covariance at the first step.
     """
-    try:
-        cvxpy = import_module("cvxpy")
-    except ImportError as error:
-        raise ImportError("cvxpy is missing: pip install 'tailgate[cvxpy]'") from error
+    cvxpy = optional("cvxpy", "cvxpy", "cvxpy is missing")
     C, R = model.C[0], model.R[0]
     q, size = len(C), steps * len(C)
     a, deviation = cvxpy.Variable(size), np.zeros((model.states, size))  # what each value that is injected adds to the deviation

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from tailgate.base.errors import InputError
+from tailgate.base.extras import optional
 from tailgate.core import Array, Frame
 from tailgate.core.loop import Loop, LoopState
 from tailgate.core.registry import entry_for
@@ -93,10 +94,7 @@ class Window:
             self._pygame.display.quit()
 
     def _start(self, size: tuple[int, int]) -> None:
-        try:
-            import pygame
-        except ImportError as error:
-            raise ImportError("pygame is missing, which opens the window: pip install 'tailgate[viz]'") from error
+        pygame = optional("pygame", "viz", "pygame is missing, which opens the window")
         try:
             pygame.display.init()
             pygame.display.set_mode(size, pygame.RESIZABLE)

@@ -13,12 +13,12 @@ and satisfies |2 W y|_i <= lam_i, however large r is. Where |2 W r|_i <= lam_i f
 
 from dataclasses import dataclass
 from functools import cache
-from importlib import import_module
 from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 
 from tailgate import num
+from tailgate.base.extras import optional
 from tailgate.core import Array, Innovation, Model, Positive, param
 from tailgate.core.registry import register
 from tailgate.estimators.compose import AcceptAll, Composed
@@ -153,10 +153,7 @@ def _problem(q: int) -> tuple[Any, dict[str, Any], Any]:
 
 def load_cvxpy() -> Any:
     """Return the package cvxpy. Raise ImportError with the command that installs it."""
-    try:
-        return import_module("cvxpy")
-    except ImportError as error:
-        raise ImportError("cvxpy is missing: pip install 'tailgate[cvxpy]'") from error
+    return optional("cvxpy", "cvxpy", "cvxpy is missing")
 
 
 def believed_by_cvxpy(r: Array, S: Array, lam: Array) -> Array:

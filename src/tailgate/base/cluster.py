@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 from tailgate.base import own_modules, sizes, sources
 from tailgate.base.errors import InputError, said
+from tailgate.base.extras import optional
 from tailgate.base.pool import Answer, answer, done, hired
 
 RETRIES = 3  # times that a job is given again whose worker was lost
@@ -133,10 +134,7 @@ def on_ray(address: str | None = None, workers: int = 1) -> Iterator[None]:
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    try:
-        import ray
-    except ImportError as error:
-        raise ImportError("a cluster needs Ray: pip install 'tailgate[ray]'") from error
+    ray = optional("ray", "ray", "a cluster needs Ray")
     before = {number: signal.getsignal(number) for number in _SIGNALS}
     size: dict[str, Any] = {"num_cpus": sizes.check("workers", workers)} if address is None else {}
     if address is not None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tailgate.base.errors import unknown
+from tailgate.base.extras import optional
 from tailgate.base.files import writable_directory, write_atomic
 from tailgate.base.pytree import Array
 
@@ -36,11 +37,7 @@ MARKERS = "osD^v<>PX*phd"
 
 def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Figure, Array]:
     """Return a matplotlib figure and its axes (rows, columns), without the global state of pyplot."""
-    try:
-        from matplotlib import figure as made
-    except ImportError as error:
-        raise ImportError("figures need matplotlib: pip install 'tailgate[viz]'") from error
-    figure = made.Figure(figsize=(width, height), layout="constrained")
+    figure = optional("matplotlib.figure", "viz", "figures need matplotlib").Figure(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 

@@ -7,6 +7,7 @@ from html import escape
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from tailgate.base.extras import optional
 from tailgate.evaluation.rows import Row
 from tailgate.evaluation.summary import cell_of, summarise
 
@@ -19,11 +20,7 @@ COLUMNS = ("scenario", "dose", "defence", "attack", "episodes", "collisions", "s
 
 def needs_pandas() -> ModuleType:
     """Return pandas. Raises ImportError that names the extra where it is missing."""
-    try:
-        import pandas
-    except ImportError as error:
-        raise ImportError("a DataFrame needs pandas: pip install 'tailgate[pandas]'") from error
-    found: ModuleType = pandas
+    found: ModuleType = optional("pandas", "pandas", "a DataFrame needs pandas")
     return found
 
 

@@ -18,6 +18,7 @@ from tailgate.agents.policy.network_policy import PolicyPlan, choose
 from tailgate.agents.policy.rules import Leaf, Split, Tree, save_rules
 from tailgate.base import sizes
 from tailgate.base.errors import InputError
+from tailgate.base.extras import optional
 from tailgate.base.files import set_aside
 from tailgate.core import Array, draws
 from tailgate.core.kinds import EFFECTS
@@ -119,13 +120,10 @@ def fitted(shown: Shown, leaves: int) -> Split | Leaf:
 
     Raises ImportError without scikit-learn.
     """
-    try:
-        from sklearn.tree import DecisionTreeClassifier
-    except ImportError as error:
-        raise ImportError("scikit-learn is missing: pip install 'tailgate[train]'") from error
+    tree = optional("sklearn.tree", "train", "scikit-learn is missing")
     if len(np.unique(shown.action)) < 2:
         return Leaf(int(shown.action[0]) if len(shown.action) else 0)
-    made = DecisionTreeClassifier(max_leaf_nodes=leaves, class_weight="balanced", random_state=0)
+    made = tree.DecisionTreeClassifier(max_leaf_nodes=leaves, class_weight="balanced", random_state=0)
     made.fit(shown.observation.astype(np.float32), shown.action)
     held, classes = made.tree_, made.classes_
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, NotApplicable
+from tailgate.base.extras import optional
 from tailgate.base.files import replacing, sweep, writable_directory, write_atomic, write_json
 from tailgate.base.locks import alone
 from tailgate.base.pytree import duplicate
@@ -46,12 +47,8 @@ _MODES = np.array([mode.name.lower() for mode in Mode])
 
 def pyarrow() -> tuple[ModuleType, ModuleType]:
     """Import pyarrow and pyarrow.parquet."""
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError as error:
-        raise ImportError("logs need pyarrow: pip install 'tailgate[log]'") from error
-    return pyarrow, pyarrow.parquet
+    first, second = (optional(name, "log", "logs need pyarrow") for name in ("pyarrow", "pyarrow.parquet"))
+    return first, second
 
 
 def write_log(
