@@ -39,11 +39,6 @@ def from_db(value: float) -> float:
     return float(num.exp(value * (_LN10 / 10.0)))
 
 
-def to_db(ratio: Array | float) -> Array:
-    """Return 10 log10(ratio)."""
-    return np.asarray(num.log(np.asarray(ratio, np.float64)) * (10.0 / _LN10))
-
-
 # The closed forms, elementwise.
 
 

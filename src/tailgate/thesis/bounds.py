@@ -130,31 +130,6 @@ def replay_mean(A: Array, B: Array, C: Array, L: Array, K: Array, S: Array, Qu: 
     return float(len(C) + 2.0 * np.trace(C.T @ np.linalg.solve(S, C @ U)))
 
 
-def watermark_cost(B: Array, S: Array, V: Array, Qu: Array) -> float:
-    """Return by how much a watermark Qu raises the mean of x'Wx + u'Vu under the optimal feedback: tr((V + B'SB) Qu).
-
-    S solves the Riccati equation of the feedback: S = W + A'SA - A'SB (V + B'SB)^-1 B'SA.
-    """
-    return float(np.trace((V + B.T @ S @ B) @ Qu))
-
-
-def lock_out(steady: Steady, Q: Array, steps: int, index: int = 0) -> float:
-    """Return about how many honest samples a gate rejects after `steps` stealth steps along state `index`, while that is positive.
-
-    (n^2 (P- - P+)_pp - S_pp) / Q_pp: the displacement n c against a gate that opens by Q_pp a step. Sensor `index` reads state `index`.
-    """
-    gained = (steady.before - steady.after)[index, index]
-    return float((steps * steps * gained - steady.S[index, index]) / Q[index, index])
-
-
-def reopening(steady: Steady, Q: Array, bias: float, eta: float, index: int = 0) -> float:
-    """Return about how many samples with a lasting bias on the sensor of a random-walk state a gate rejects before it opens again.
-
-    The gate opens when eta S_pp has grown to bias^2: alarms stop, and the error becomes the bias.
-    """
-    return float((bias * bias / eta - steady.S[index, index]) / Q[index, index])
-
-
 def false_alarm_rate(eta: float) -> float:
     """Return Pr(chi2_2 > eta) = exp(-eta / 2), the rate per step with two sensors."""
     return float(np.exp(-0.5 * eta))

@@ -1,4 +1,4 @@
-"""Guarantees of the resilient distributed estimators (thesis, Theorems 5.3.3, 5.3.4, 6.5.3 and 6.5.4, restated), for steady gains.
+"""Guarantees of the resilient distributed estimators (thesis, Theorems 5.3.4 and 6.5.4, restated), for steady gains.
 
     (5.8)   norm_resilient     (6.26)   lasso_dkf
 
@@ -81,40 +81,3 @@ def _worst_signs(model: Model, lam: float | Array, fusion: Fusion | None) -> tup
             if size.max() > best:
                 best, out[i] = float(size.max()), signs[np.argmax(size)]
     return push, out
-
-
-def weighted_error(model: Model, error: Array, fusion: Fusion | None = None) -> Array:
-    """Return (..., N) sqrt(e_i' P_i^-1 e_i) of errors e (..., N, n), P_i being the fixed point of (5.5)."""
-    fusion = fusion or fixed_point(model)
-    inverse = np.linalg.inv(fusion.P)
-    return np.asarray(np.sqrt(np.einsum("...in,inm,...im->...i", error, inverse, error)))
-
-
-def norm_basin(model: Model, lam: float, fusion: Fusion | None = None) -> Array:
-    """Return (N,) lam / |Sv_i^-1/2 C_i P_i^1/2|_2; infinite for a blind agent.
-
-    Without attack and noise (5.8) converges if the largest `weighted_error` before the first prediction is at most the least of these.
-    Then for every agent i
-
-        { x' P_i^-1 x <= max_j e_j' P_j^-1 e_j }  lies in  { |Sv_i^-1/2 C_i x|_2 <= lam }
-
-    Erratum: Theorem 5.3.3 has 2 lam, for which one state with a = 1.5, c = 0.1 diverges, and bounds each agent by its own error only.
-    """
-    fusion = fusion or fixed_point(model)
-    size = np.linalg.norm(_white(model) @ np.linalg.cholesky(fusion.P), 2, axis=(1, 2))
-    return _over(lam, size)
-
-
-def lasso_basin(model: Model, lam: float | Array, fusion: Fusion | None = None) -> Array:
-    """Return (N,) the least over the sensors l of lam_l / |(Sv_i^-1 C_i P_i^1/2)_l|_2: as `norm_basin`, for (6.26).
-
-    The set is { |(Sv_i^-1 C_i x)_l| <= lam_l }. Erratum: Theorem 6.5.3 has the 2-norm of Sv^-1/2 C x and 2 lam in (6.28).
-    """
-    fusion = fusion or fixed_point(model)
-    size = np.linalg.norm(np.linalg.solve(model.R, model.C) @ np.linalg.cholesky(fusion.P), axis=2)
-    return np.asarray(_over(np.broadcast_to(lam, size.shape), size).min(axis=1))
-
-
-def _over(lam: float | Array, size: Array) -> Array:
-    """Return lam / size, infinite where size is 0."""
-    return np.asarray(np.divide(lam, size, out=np.full(size.shape, np.inf), where=size > 0.0))
