@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -173,3 +174,14 @@ def test_rivals_that_cannot_act_here_are_left_out() -> None:
     assert "each of its commands is refused" in left_out(rows)
     assert left_out([{**rows[0], "attack_steps": 1}]) == left_out(rows[1:]) == ""
     assert left_out([{"status": "skipped", "reason": "no radar"}]) == "no radar"
+
+
+def test_a_run_of_something_else_decides_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is set aside, and what is trained in its place has the horizon that was asked for."""
+    config = training.load_config("gusty", [f"out={tmp_path}", "name=old"])
+    config.directory.mkdir()
+    write_json(config.directory / "config.json", {"steps": 1, "scenario": "other"})
+    asked: list[Any] = []
+    monkeypatch.setattr("tailgate.training.train.train_together", lambda runs, *_: asked.extend(runs))
+    train_against([config], lambda *_: None)
+    assert asked == [(config, False)] and config.horizon_ends

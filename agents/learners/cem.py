@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,11 +29,10 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 from threadpoolctl import threadpool_limits
 
-from tailgate.agents.learners.learning import CONTINUOUS, DISCRETE, SEED_STRIDE, Progress, header_of, open_checkpoint
+from tailgate.agents.learners.learning import CONTINUOUS, DISCRETE, SEED_STRIDE, Progress, header_of, open_checkpoint, write_checkpoint
 from tailgate.agents.learners.teacher import Demonstration
 from tailgate.agents.policy.network_policy import save_policy
 from tailgate.base.errors import InputError
-from tailgate.base.files import write_atomic
 from tailgate.base.sizes import Passes, Rows, Width
 from tailgate.core import Array, NonNegative, Positive, PositiveCount, Probability, draws, param
 from tailgate.core.neural import Network
@@ -207,7 +205,7 @@ class Search:
         if self.best is not None:
             facts["best"] = [self.best.start, self.best.score]
             tensors |= {"best_mean": self.best.mean, "best_sd": self.best.sd}
-        write_atomic(path, save_tensors(tensors, {"facts": json.dumps(facts)}))
+        write_checkpoint(path, save_tensors, tensors, facts)
 
     def load(self, path: Path) -> None:
         """Continue from a checkpoint; raise InputError when it is damaged or of another run."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import platform
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 from tailgate.base.errors import InputError, unknown
+from tailgate.base.files import write_atomic
 from tailgate.base.lazy import components
 from tailgate.base.reading import TENSORS, parse_json, read_bytes, tensors_of
 
@@ -106,10 +109,26 @@ def check_action(name: str, seat: Seat) -> None:
         raise InputError("learner", name, f"one for the action {action}, or for {name} one of: {', '.join(actions)}")
 
 
+def write_checkpoint(path: Path, save_tensors: Callable[[Any, dict[str, str]], bytes], tensors: Any, facts: dict[str, Any]) -> None:
+    """Write tensors and facts, with a digest of both."""
+    text = json.dumps(facts)
+    digest = _digest(save_tensors(tensors, {}), text)
+    write_atomic(path, save_tensors(tensors, {"facts": text, "sha256": digest}))
+
+
+def _digest(content: bytes, facts: str) -> str:
+    """Return the digest of the numbers in safetensors, which follow a header of a length, and of facts."""
+    header = int.from_bytes(content[:8], "little")
+    return hashlib.sha256(content[8 + header :] + facts.encode()).hexdigest()
+
+
 def open_checkpoint(path: Path, wanted: dict[str, Any], load_tensors: Callable[[bytes], Any]) -> tuple[Any, dict[str, Any]]:
     """Return tensors and facts of a checkpoint. Raise InputError when it is damaged, or when its facts are not the `wanted` ones."""
     try:
-        tensors, about = tensors_of(read_bytes(path, TENSORS), load_tensors)
+        content = read_bytes(path, TENSORS)
+        tensors, about = tensors_of(content, load_tensors)
+        if about.get("sha256", "") not in ("", _digest(content, about["facts"])):
+            raise ValueError("another digest")
         facts = parse_json(about["facts"], strict=False)
         held = {key: facts.get(key) for key in wanted}
     except (OSError, ValueError, KeyError, AttributeError) as error:

@@ -39,10 +39,10 @@ from tailgate.agents.learners.learning import (
     check_action,
     header_of,
     open_checkpoint,
+    write_checkpoint,
 )  # fmt: skip
 from tailgate.agents.policy.network_policy import save_policy
 from tailgate.base.errors import InputError
-from tailgate.base.files import write_atomic
 from tailgate.base.sizes import Episodes, Passes, Rows, Width
 from tailgate.core import Array, Positive, PositiveCount, Probability, param
 from tailgate.core.neural import Network
@@ -187,7 +187,7 @@ class StableLearner:
             "steps": model.num_timesteps, "numpy_position": int(position), "curve": self.curve, "ended": list(self.ended),
             "counters": {name: int(getattr(model, name)) for name in COUNTERS if hasattr(model, name)},
         }  # fmt: skip
-        write_atomic(path, save_tensors(tensors, {"facts": json.dumps(facts)}))
+        write_checkpoint(path, save_tensors, tensors, facts)
 
     def load(self, path: Path) -> None:
         """Continue from a checkpoint; raise InputError when it is damaged or of another run."""

@@ -116,7 +116,8 @@ def demonstrate(seat: Seat, attack: Attack, seed: int, episodes: int) -> Demonst
     gained, live = played["reward"], played["live"]
     if not played["action"][live].any():
         kinds = ", ".join(sorted({mode.kind.name.lower() for mode in seat.action.modes[1:]}))
-        raise InputError("teacher", type(attack).__name__, f"a script that attacks here with a kind that an action has: {kinds}")
+        asked = f"a script that attacks in one of {episodes} episodes here, with a kind that an action has: {kinds}"
+        raise InputError("teacher", type(attack).__name__, asked)
     for k in range(len(gained) - 2, -1, -1):
         gained[k] += seat.reward.gamma * gained[k + 1]
     latest = np.arange(len(gained))

@@ -23,6 +23,10 @@ class InputError(ValueError):
         """The first of the rows."""
         return self.rows[0] if self.rows else None
 
+    @row.setter
+    def row(self, row: int | None) -> None:
+        self.rows = () if row is None else (row,)
+
     def __init__(self, field: str, value: object, expected: str) -> None:
         shown = " ".join(repr(value).split())
         shown = _cut(shown, 120)
@@ -74,6 +78,10 @@ def _cut(text: str, most: int) -> str:
 def one_line(text: str) -> str:
     """Return the text in one line, with control characters written out, safe for a terminal."""
     return text if text.isprintable() else "".join(ch if ch.isprintable() else " " if ch.isspace() else repr(ch)[1:-1] for ch in text)
+
+
+class NotWritable(InputError):
+    """A place that cannot be written to, such as on a full disk: the input is to blame for nothing."""
 
 
 class Killed(InputError):

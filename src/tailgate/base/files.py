@@ -15,8 +15,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO
 
-from tailgate.base.errors import InputError
+from tailgate.base.errors import InputError, NotWritable
 
+_UMASK = os.umask(0o077)  # it can only be read by setting it, which other threads would see later
+os.umask(_UMASK)
 GENERATOR = b'<meta name="generator" content="Tailgate">'  # in every page
 TEMPORARY = ".tmp"  # suffix of temporary files
 
@@ -56,6 +58,7 @@ def replacing(path: Path, field: str = "out") -> Iterator[IO[bytes]]:
     InputError
         The path cannot be written; the error names `field`.
     """
+    check_regular(path, field)
     try:
         _make(path.parent)
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=TEMPORARY)
@@ -68,16 +71,22 @@ def replacing(path: Path, field: str = "out") -> Iterator[IO[bytes]]:
             file.flush()
             _before("fsync", path)
             os.fsync(file.fileno())
-        os.chmod(name, 0o644)
+        os.chmod(name, 0o666 & ~_UMASK)
         _before("rename", path)
         os.replace(name, path)
     except BaseException as error:
         with contextlib.suppress(OSError):
             os.unlink(name)
         if isinstance(error, OSError):
-            raise InputError(field, str(path), f"a writable path ({error.strerror})") from None
+            raise NotWritable(field, str(path), f"a writable path ({error.strerror})") from None
         raise
     _sync(path.parent)
+
+
+def check_regular(path: Path, field: str = "out") -> None:
+    """Raise InputError for a device or a pipe: a result would replace it by a file."""
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise InputError(field, str(path), "a regular file, or one that does not exist yet")
 
 
 def write_atomic(path: Path, content: bytes, field: str = "out") -> None:
@@ -114,8 +123,8 @@ def remove(path: Path) -> None:
 def _refused(field: str, path: Path, what: str, error: OSError) -> InputError:
     """Return the error for a path that cannot be written; it names a file that blocks a directory, if there is one."""
     if files := [str(above) for above in path.parents if os.path.isfile(above)]:
-        return InputError(field, files[0], "a writable directory, not a file")
-    return InputError(field, str(path), f"a writable {what} ({error.strerror})")
+        return NotWritable(field, files[0], "a writable directory, not a file")
+    return NotWritable(field, str(path), f"a writable {what} ({error.strerror})")
 
 
 def writable_directory(path: Path, field: str = "out", asked: Path | None = None) -> Path:

@@ -10,6 +10,7 @@ import contextlib
 import errno
 import fcntl
 import os
+import stat
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,7 +24,8 @@ _held: dict[tuple[str, int], int] = {}  # by place and thread: nesting depth, be
 
 def lock_of(place: Path) -> Path:
     """Return the lock file of a place; it is next to the place, because a directory may be renamed."""
-    place = Path(os.path.abspath(place))
+    folder = os.path.isdir(place)  # a link to a folder is the folder
+    place = Path(os.path.realpath(place)) if folder else Path(os.path.realpath(Path(place).parent)) / Path(place).name
     return place.with_name(f".{place.name}{SUFFIX}")
 
 
@@ -48,7 +50,7 @@ def _taken(place: Path, field: str) -> int | None:
     path = lock_of(place)
     while True:
         try:
-            handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            handle = _opened(path, field)
         except FileNotFoundError:
             writable_directory(path.parent, field, place)
             continue
@@ -67,13 +69,38 @@ def _taken(place: Path, field: str) -> int | None:
                 raise InputError(field, str(place), f"a place that no other command writes to now{who}") from None
             os.close(handle)
             return None
+        if path == place:
+            return handle
+        there = 0
         with contextlib.suppress(OSError):
-            if path == place or os.stat(path).st_ino == os.fstat(handle).st_ino:
-                if path != place:
-                    os.ftruncate(handle, 0)
-                    os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
-                return handle
+            there = os.stat(path, follow_symlinks=False).st_ino
+        if there == os.fstat(handle).st_ino:
+            with contextlib.suppress(OSError):  # a full disk, or the file of another user: who holds it is not told then
+                os.ftruncate(handle, 0)
+                os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
+            return handle
         os.close(handle)  # the last holder has just removed it
+
+
+def _opened(path: Path, field: str) -> int:
+    """Open a lock file, also one that another user has left; raise InputError for a link, which could name any file."""
+    for flags in (os.O_RDWR | os.O_CREAT, os.O_RDONLY):
+        try:
+            handle = os.open(path, flags | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
+        except PermissionError:
+            if flags == os.O_RDONLY:
+                raise
+            continue
+        except OSError as error:
+            if error.errno == errno.ELOOP:
+                raise InputError(field, str(path), "a file of its own, no link") from None
+            raise
+        found = os.fstat(handle)
+        if stat.S_ISREG(found.st_mode) and found.st_nlink <= 1:
+            return handle
+        os.close(handle)
+        raise InputError(field, str(path), "a file of its own, with no other name")
+    raise AssertionError("one of both is opened, or raises")
 
 
 def _let_go(place: Path, handle: int | None) -> None:

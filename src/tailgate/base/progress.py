@@ -1,5 +1,6 @@
 """Progress of long work on standard error: a bar on a terminal, elsewhere a line per tenth, or a minute after the last one."""
 
+import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -35,7 +36,7 @@ def progress(shown_on: Console) -> Iterator[Update]:
     if _silent.get():
         yield lambda *_: None
         return
-    if not shown_on.is_terminal:
+    if not shown_on.is_terminal or shown_on.is_dumb_terminal:
         shown: dict[str, int] = {}
         begun: dict[str, tuple[float, int]] = {}
         said = time.monotonic()
@@ -52,7 +53,8 @@ def progress(shown_on: Console) -> Iterator[Update]:
                 took = now - since
                 left = took * (total - done) / (done - before) if done > before else 0.0
                 times = f" ({lasting(took)}{f', about {lasting(left)} left' if left >= 60.0 else ''})" if took >= 1.0 else ""
-                shown_on.print(f"{label}: {percent} % {figures}".rstrip() + times, highlight=False, soft_wrap=True, markup=False)
+                with contextlib.suppress(OSError):  # nobody reads it, or the disk is full: progress is worth no run
+                    shown_on.print(f"{label}: {percent} % {figures}".rstrip() + times, highlight=False, soft_wrap=True, markup=False)
 
         yield line
         return

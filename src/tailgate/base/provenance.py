@@ -34,9 +34,11 @@ def commit() -> str | None:
 
     def asked(*words: str) -> str:
         command = ["git", "--no-optional-locks", "-C", str(FOLDER.resolve()), *words]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+        rest = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}  # which may name another repository
+        return subprocess.run(command, capture_output=True, text=True, check=True, env=rest).stdout.strip()
 
     try:
+        asked("ls-files", "--error-unmatch", "__init__.py")  # else it is installed in somebody's own repository
         return asked("rev-parse", "HEAD") + (" with changes" if asked("status", "--porcelain", "-uno", ".") else "")
     except (OSError, subprocess.CalledProcessError):
         return None

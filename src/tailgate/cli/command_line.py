@@ -16,11 +16,13 @@ import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NoReturn
 
 import tailgate
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, Killed
+from tailgate.base.files import check_regular
 from tailgate.base.interrupts import Ending, orderly
 from tailgate.base.progress import silent
 from tailgate.cli.completion import complete
@@ -67,6 +69,10 @@ def _done(arguments: Sequence[str] | None, chosen: argparse.Namespace, ending: E
             return ending.last_words(error)
         if isinstance(error, OSError) and (error.filename is not None or error.errno in FULL):
             error = InputError("file", str(error.filename or "standard output"), f"one that can be used ({error.strerror})")
+        from tailgate.sandbox.limits import Lost
+
+        if isinstance(error, Lost):
+            error = InputError("defence", "in a sandbox", f"a class whose process goes on ({error})")
         if not isinstance(error, InputError) and not (isinstance(error, ImportError) and "tailgate[" in str(error)):
             raise
         print(f"tailgate: error: {error}", file=sys.stderr)
@@ -80,6 +86,8 @@ def _check_paths(chosen: argparse.Namespace) -> None:
     for name in WRITTEN:
         if getattr(chosen, name, None) == "":
             raise InputError(f"--{name}", "", "a path")
+        if getattr(chosen, name, None):
+            check_regular(Path(getattr(chosen, name)), f"--{name}")
 
 
 @contextmanager

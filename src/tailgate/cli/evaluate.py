@@ -12,7 +12,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tailgate.base.files import writable_directory
-from tailgate.cli.shared import Commands, add_options, counted, own_classes, say, show, table, tell, telling_aside, threat_of, working
+from tailgate.cli.shared import (
+    Commands,
+    add_options,
+    counted,
+    figures,
+    own_classes,
+    say,
+    show,
+    table,
+    tell,
+    telling_aside,
+    threat_of,
+    working,
+)
 from tailgate.core.schema import canonical, scalar
 
 if TYPE_CHECKING:
@@ -60,6 +73,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     if options.suite is None and options.scenario:  # a scenario by itself: what is not named is quick-v0's, but for the dose
         suite = dataclasses.replace(load_suite(DEFAULT), name="custom", doses=(None,))
     if options.plot:
+        figures()
         writable_directory(Path(options.plot), "plot")
     options.kept = f"the same command goes on with the rows of {options.out}" if options.out else "nothing is kept: --out FILE would"
     with telling_aside(options.out, "something else than these rows"), working() as update:

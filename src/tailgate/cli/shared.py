@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import secrets
 import shlex
@@ -16,6 +17,7 @@ from rich.console import Console
 
 from tailgate.base import own_modules
 from tailgate.base.errors import InputError, one_line
+from tailgate.base.extras import optional
 from tailgate.base.files import aside, set_aside, writable_directory
 from tailgate.base.plots import FORMS
 from tailgate.base.progress import Update, console, progress
@@ -100,7 +102,14 @@ def picture(option: str, text: str | None) -> Path | None:
     """Return the file of a picture, if any. Raises InputError for one that cannot be written, or has another ending than a picture's."""
     if text is not None and Path(text).suffix.lower().removeprefix(".") not in FORMS:
         raise InputError(option, text, f"a file name that ends in {', '.join('.' + form for form in FORMS)}")
+    if text is not None:
+        figures()
     return written(option, text)
+
+
+def figures() -> None:
+    """Raise ImportError with what installs it if the package for figures is missing, before anything is played."""
+    optional("matplotlib", "viz", "figures need matplotlib")
 
 
 @contextmanager
@@ -144,7 +153,8 @@ def counted(update: Update, label: str, of: str = "cells") -> Callable[[int, int
 
 def tell(text: str) -> None:
     """Print a line for people on standard error."""
-    print(f"tailgate: {one_line(text)}", file=sys.stderr)
+    with contextlib.suppress(OSError):  # nobody reads it, or the disk is full
+        print(f"tailgate: {one_line(text)}", file=sys.stderr)
 
 
 def print_json(data: object) -> None:

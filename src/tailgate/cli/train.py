@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,8 +57,8 @@ def _train(options: argparse.Namespace) -> int:
     errors = Console(stderr=True)
     said = f"{config.name}: training against {config.defence} on {config.scenario}, files in {config.directory}"
     errors.print(said, markup=False, highlight=False, soft_wrap=True)
-    place = f" out={config.out}" if config.out != type(config)().out else ""
-    options.kept = f"what was finished is kept, go on with: tailgate train --resume name={config.name}{place}"
+    place = f" {shlex.quote(f'out={config.out}')}" if config.out != type(config)().out else ""
+    options.kept = f"what was finished is kept, go on with: tailgate train --resume {shlex.quote(f'name={config.name}')}{place}"
     with telling_aside(config.directory, "an earlier run"), alone(config.directory), progress(errors) as update:
 
         decisions: dict[int, int] = {}

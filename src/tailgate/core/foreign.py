@@ -50,6 +50,8 @@ def attribute_of(family: str, text: str, fits: Callable[[object], bool], kind: s
         raise InputError(family, text, f"an importable module ({error}){_searched(module, error)}") from None
     except SyntaxError as error:
         raise InputError(family, text, f"a module without syntax errors ({error.msg}, line {error.lineno})") from None
+    except SystemExit as error:
+        raise InputError(family, text, f"a module that can be imported (it ends the process: {error.code!r})") from None
     except Exception as error:  # whatever its first lines do
         raise InputError(family, text, f"a module that can be imported ({with_place(error)})") from None
     if found is None:

@@ -102,12 +102,16 @@ def apart(
             broken = ~results["demands"].all(axis=1) if "demands" in results else np.zeros(rows, bool)
             if not broken.any():
                 return f"step {number}: {found}"
+            if found.rows and set(found.rows) != set(np.flatnonzero(broken).tolist()):
+                return f"whose numbers break a demand, step {number}"
             kept = np.flatnonzero(~broken)
             if len(kept) < FEW and number > ENOUGH:
                 return ""
             if len(kept) < FEW:
                 return f"the errors that end most episodes, such as {found}"
             return apart(program, map_leaves(lambda leaf: leaf[kept], first), step, horizon, later)  # noqa: B023
+        if "demands" in results and not results["demands"].all():
+            return f"a demand, step {number}"
         begun, wanted = found
         got, held = results | {name: state.get_leaf(name) for name in program.places}, leaves(begun) | dict(wanted)
         for name in (*program.places, *wanted):

@@ -18,6 +18,7 @@ from tailgate.engine import reductions
 from tailgate.engine.array import NEW, Traced, chosen, lifted, result_type, shared_batch, stored, typed
 from tailgate.engine.buffers import boxed, swept, wide
 from tailgate.engine.graph import Graph, Node
+from tailgate.engine.objects import compiling
 from tailgate.engine.operations import BOOL, Array, ArrayLike, DTypeLike, Shape
 from tailgate.engine.operators import python_number
 from tailgate.engine.untraceable import Untraceable, traces
@@ -289,8 +290,21 @@ def made(graph: Graph, shape: Shape, value: ArrayLike, dtype: np.dtype[Any]) -> 
 _LIBRARIES = ("numpy", "scipy", "torch", "filterpy", "cvxpy", "gymnasium", "llvmlite")
 _here = threading.local()
 _lock = threading.RLock()
-if hasattr(os, "register_at_fork"):  # a child has no thread that would release it, and would keep traced constructors
-    os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release)
+
+
+def _hold() -> None:
+    """Wait for the traces of other threads before a fork: the child would keep their constructors, and locks that nobody releases."""
+    _lock.acquire()
+    compiling.acquire()  # in the order of a trace that compiles a function on its way
+
+
+def _go_on() -> None:
+    compiling.release()
+    _lock.release()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_hold, after_in_parent=_go_on, after_in_child=_go_on)
 
 
 def _makers(graph: Graph) -> dict[str, Callable[..., Any]]:

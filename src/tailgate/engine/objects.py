@@ -23,9 +23,7 @@ from tailgate.base.errors import InputError
 VERSION = b"2"  # of this module's translation
 KEPT = 4000  # most recently used files in the folder
 BASIC = ".basic.o"  # how the names of the code of `tailgate.num` end
-_lock = threading.RLock()
-if hasattr(os, "register_at_fork"):  # a child has no thread that would release it
-    os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release)
+compiling = threading.RLock()
 
 
 @cache
@@ -71,7 +69,8 @@ def folder() -> Path | None:
     with contextlib.suppress(OSError, RuntimeError):  # RuntimeError: this user has no home
         base = os.environ.get("TAILGATE_CACHE") or os.path.join(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "tailgate")
         place = Path(base) / "objects"
-        place.mkdir(parents=True, exist_ok=True, mode=0o700)
+        for missing in (*reversed([above for above in place.parents if not above.exists()]), place):
+            missing.mkdir(exist_ok=True, mode=0o700)  # whatever the umask lets others do
         if not hasattr(os, "getuid") or _safe(str(place.resolve())):
             return place
     return None
@@ -150,7 +149,7 @@ class Function:
     """The compiled functions `step`, and `bound`, which takes the address of its arguments. Calls release Python's lock."""
 
     def __init__(self, text: str, basic: bool = False) -> None:
-        with _lock:
+        with compiling:
             binding = _binding()
             key = "\0".join((text, str(level()), *processor(), binding.llvm_version_info and str(binding.llvm_version_info))).encode()
             name = hashlib.sha256(VERSION + key).hexdigest() + (BASIC if basic else ".o")

@@ -52,37 +52,63 @@ class Snapshot(NamedTuple):
         return "" if self[:2] == now[:2] else "a global"
 
 
-def _set_back(box: Any, content: dict[str, Any]) -> None:
-    """Give an object, also a frozen one, or a class its attributes back."""
-    write, erase = (type.__setattr__, type.__delattr__) if isinstance(box, type) else (object.__setattr__, object.__delattr__)
-    now = _content(box)
-    for name in now.keys() - content.keys():
-        erase(box, name)
-    for name, value in content.items():
-        if now.get(name, content) is not value:
-            write(box, name, value)
-
-
 class Contents(NamedTuple):
     """The content of objects, containers and globals at a time."""
 
     boxes: list[tuple[Any, Any]]
     rooms: list[tuple[dict[str, Any], str, Any]]
 
-    def put_back(self) -> None:
-        """Write it back."""
+    def put_back(self, nodes: bool = False) -> None:
+        """Write it back; with `nodes` only where traced arrays are now, as others may write to globals meanwhile."""
         for box, content in self.boxes:
-            if isinstance(box, (np.ndarray, list)):
-                if box is not content:
-                    box[:] = content
-            elif isinstance(box, BOXES):
-                box.clear()
-                fill: Any = box.extend if isinstance(box, deque) else box.update  # type: ignore[union-attr]
-                fill(content)
-            else:
-                _set_back(box, content)
+            if not nodes or _has_nodes(_content(box)):
+                with contextlib.suppress(Exception):  # whatever somebody's class does to who writes to it
+                    _set_back(box, content)
         for room, name, value in self.rooms:
-            room[name] = value
+            if nodes and _has_nodes(room.get(name)):
+                room[name] = value
+
+
+def _set_back(box: Any, content: Any) -> None:
+    """Give a container, an array, an object, also a frozen one, or a class its content back."""
+    if isinstance(box, np.ndarray):
+        if box.shape == content.shape and box.tobytes() != content.tobytes():
+            held, box.flags.writeable = box.flags.writeable, True
+            box[...] = content
+            box.flags.writeable = held
+    elif isinstance(box, list):
+        box[:] = content
+    elif isinstance(box, BOXES):
+        box.clear()
+        fill: Any = box.extend if isinstance(box, deque) else box.update  # type: ignore[union-attr]
+        fill(content)
+    else:
+        write, erase = (type.__setattr__, type.__delattr__) if isinstance(box, type) else (object.__setattr__, object.__delattr__)
+        now = _content(box)
+        for name in now.keys() - content.keys():
+            erase(box, name)
+        for name, value in content.items():
+            if now.get(name, content) is not value:
+                write(box, name, value)
+
+
+def _content(box: Any) -> Any:
+    if isinstance(box, np.ndarray):
+        return box.copy()
+    if isinstance(box, types.CellType):
+        return {"cell_contents": box.cell_contents} if filled(box) else {}
+    if isinstance(box, type):
+        return {name: part for name, part in vars(box).items() if not name.startswith("__")}
+    return copy.copy(box) if isinstance(box, BOXES) else attributes(box)
+
+
+def _has_nodes(held: Any, depth: int = 4) -> bool:
+    """Return True if traced arrays are in a container or are the thing itself."""
+    if isinstance(held, (Traced, Node)):
+        return True
+    if not depth or not isinstance(held, (*BOXES, tuple)):
+        return isinstance(held, np.ndarray) and held.dtype == object and any(isinstance(part, (Traced, Node)) for part in held.flat)
+    return any(_has_nodes(part, depth - 1) for part in (held.values() if isinstance(held, dict) else held))
 
 
 class Parameters:
@@ -134,7 +160,7 @@ class Parameters:
         try:
             yield
         finally:
-            before.put_back()
+            before.put_back(nodes=True)
             for cache, count in misses.items():
                 if cache.cache_info().misses != count:
                     cache.cache_clear()
@@ -143,6 +169,11 @@ class Parameters:
         """Return a shallow copy of what code may write to."""
         boxes = [*self._objects, *self._read.boxes.values()]
         return Contents([(box, _content(box)) for box in boxes], [(room, name, room[name]) for room, name in self._read.rooms])
+
+    def own_contents(self) -> Contents:
+        """Return the same of objects that no global names: others may write to those."""
+        boxes = [*self._objects, *(box for number, box in self._read.boxes.items() if number in self._read.own)]
+        return Contents([(box, _content(box)) for box in boxes], [])
 
 
 class Reading:
@@ -269,7 +300,7 @@ class _Reader:
             return held
         self.changeable = self.changeable or not _frozen(type(held))
         if self._owned:
-            self.read.boxes[id(held)] = held
+            self.read.box(held)
         out = copy.copy(held)
         self._known[id(held)] = number, held, out  # before its parts, which may refer to it
         fields = attributes(held)
@@ -313,11 +344,3 @@ class _Reader:
 
 def _frozen(kind: type[Any]) -> bool:
     return bool(kind.__dataclass_params__.frozen)
-
-
-def _content(box: Any) -> Any:
-    if isinstance(box, np.ndarray):
-        return box.copy() if box.flags.writeable and box.ndim else box
-    if isinstance(box, type):
-        return {name: part for name, part in vars(box).items() if not name.startswith("__")}
-    return copy.copy(box) if isinstance(box, BOXES) else attributes(box)

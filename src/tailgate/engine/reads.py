@@ -6,15 +6,19 @@ Tailgate's own code is not looked through, because nobody edits it then.
 from __future__ import annotations
 
 import collections
+import datetime
 import enum
 import functools
 import logging
+import operator
 import os
 import re
 import sys
 import types
 import weakref
 from collections.abc import Iterator
+from decimal import Decimal
+from fractions import Fraction
 from pathlib import PurePath
 from typing import Any, TypeVar
 
@@ -26,13 +30,17 @@ from tailgate.engine.untraceable import Untraceable
 
 MANY = 100  # numbers of a list that are compared by their bytes
 BOXES = (list, dict, set, collections.deque)
-PLAIN = (type(None), str, bytes, bool, int, float, complex, enum.Enum, np.generic, np.dtype, PurePath)
+PLAIN = (
+    type(None), str, bytes, bool, int, float, complex, enum.Enum, np.generic, np.dtype, PurePath,
+    datetime.date, datetime.time, datetime.timedelta, Fraction, Decimal,
+)  # fmt: skip
 CODE = (type, types.BuiltinFunctionType, np.ufunc)
 _UNCHANGING = (
     types.BuiltinFunctionType, types.ModuleType, types.MethodDescriptorType, types.WrapperDescriptorType, types.MemberDescriptorType,
-    types.GetSetDescriptorType, types.MappingProxyType, types.CodeType, types.GenericAlias, np.ufunc, logging.Logger,
+    types.GetSetDescriptorType, types.CodeType, types.GenericAlias, np.ufunc, logging.Logger,
     re.Pattern, range, slice, type(Ellipsis), TypeVar,
 )  # fmt: skip
+_DATA = (*PLAIN, np.ndarray, tuple, list, dict, set, frozenset, os._Environ)
 _WRITTEN_BY_PYTHON = {
     "__module__", "__dict__", "__weakref__", "__doc__", "__qualname__", "__annotations__", "__dataclass_fields__", "__dataclass_params__",
     "__match_args__", "__slots__", "__slotnames__", "__hash__", "__parameters__", "__orig_bases__", "__abstractmethods__", "_abc_impl",
@@ -72,13 +80,16 @@ class Read:
     Attributes
     ----------
     unknown : objects whose content cannot be read, such as a generator of random numbers
-    boxes : by id, what code may write to: containers, arrays and objects with attributes
+    boxes : by id, what code may write to: containers, arrays, cells, and objects, classes and functions with attributes
+    own : ids of those boxes that no global names
     rooms : globals that are read, each a namespace and a name
     """
 
     def __init__(self) -> None:
         self.unknown: list[Any] = []
         self.boxes: dict[int, Any] = {}
+        self.own: set[int] = set()
+        self._named = 0  # how many names of globals lead to what is read now
         self.rooms: list[tuple[dict[str, Any], str]] = []
         self._seen: dict[int, tuple[int, Any]] = {}  # the objects stay alive, so that no id is used again
 
@@ -88,6 +99,12 @@ class Read:
             return "again", self._seen[id(held)][0]
         self._seen[id(held)] = len(self._seen), held
         return None
+
+    def box(self, held: Any) -> None:
+        """Note something that code may write to."""
+        self.boxes[id(held)] = held
+        if not self._named:
+            self.own.add(id(held))
 
     def function(self, function: types.FunctionType, cells: bool = True) -> tuple[Any, ...]:
         """Return the code of a function, and what it reads if it is somebody's; without `cells` if these are parameters."""
@@ -108,23 +125,32 @@ class Read:
             if isinstance(module, types.ModuleType) and module not in walked:
                 walked.append(module)
                 held += [(f"{name}.{part}", vars(module)[part]) for part in names if self._of_interest(module, part)]
+        self.box(function)
+        for cell in function.__closure__ or ():
+            self.box(cell)
         given = [*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values()]
         inside = [cell.cell_contents for cell in function.__closure__ or () if cells and filled(cell)]
-        read = [(name, self.value(value)) for name, value in (*held, *vars(function).items())]
+        self._named += 1
+        read = [(name, self.value(value)) for name, value in held]
+        self._named -= 1
+        read += [(name, self.value(value)) for name, value in vars(function).items()]
         return function.__code__, *read, *map(self.value, (*given, *inside))
 
     @staticmethod
     def _of_interest(module: types.ModuleType, name: str) -> bool:
         """Return True for what code may read of a module; of an installed one, for its data."""
         held = vars(module).get(name)
-        return name in vars(module) and (editable(module.__name__) or isinstance(held, (*PLAIN, np.ndarray, dict, list, os._Environ)))
+        return name in vars(module) and (editable(module.__name__) or isinstance(held, _DATA))
 
     def kind(self, kind: type) -> tuple[Any, ...]:
         """Return the functions of a class and its bases, and of somebody's class all that these and its attributes hold."""
         if again := self._again(kind):
             return again
         functions = tuple(part for base in kind.__mro__ for part in vars(base).values() if isinstance(part, types.FunctionType))
-        own = [part for base in kind.__mro__ if editable(base.__module__) for part in vars(base).items()]
+        theirs = [base for base in kind.__mro__ if editable(base.__module__)]
+        own = [part for base in theirs for part in vars(base).items()]
+        for base in theirs:
+            self.box(base)
         return *functions, *((name, self.value(part)) for name, part in own if name not in _WRITTEN_BY_PYTHON)
 
     def value(self, held: Any) -> Any:
@@ -143,6 +169,13 @@ class Read:
             return "partial", self.value(held.func), self.value(held.args), self.value(held.keywords)
         if isinstance(held, types.MethodType):
             return "method", self.value(held.__self__), self.value(held.__func__)
+        if isinstance(held, (operator.itemgetter, operator.attrgetter, operator.methodcaller)):
+            return type(held), repr(held)
+        if isinstance(held, types.MappingProxyType):
+            held = dict(held)
+        if isinstance(held, types.ModuleType) and editable(held.__name__):  # an attribute: nobody tells which names are read
+            data = [(name, part) for name, part in vars(held).items() if isinstance(part, _DATA) and not name.startswith("__")]
+            return self._again(held) or tuple((name, self.value(part)) for name, part in data)
         if isinstance(held, types.FunctionType):
             return self.function(held)
         if isinstance(held, type):
@@ -150,7 +183,7 @@ class Read:
         if isinstance(held, PLAIN):
             return type(held), repr(held) if isinstance(held, (float, complex)) else plain(held)
         if isinstance(held, np.ndarray) and held.dtype != object:
-            self.boxes[id(held)] = held
+            self.box(held)
             return held.shape, held.dtype.str, held.tobytes()
         if (isinstance(held, _UNCHANGING) and not _bound(held)) or _descriptor(held):
             return Same(held)
@@ -158,18 +191,18 @@ class Read:
 
     def _content(self, held: Any) -> Any:
         if isinstance(held, BOXES):
-            self.boxes[id(held)] = held
+            self.box(held)
         if isinstance(held, (tuple, list, dict, collections.deque)):
             if len(held) > MANY and not isinstance(held, dict) and all(type(part) in (int, float) for part in held):
                 return type(held), np.asarray(held).dtype.str, np.asarray(held).tobytes()
             parts = held.items() if isinstance(held, dict) else enumerate(held)
             return type(held), *((type(key), repr(key), self.value(part)) for key, part in parts)
-        if isinstance(held, (set, frozenset)) and all(isinstance(part, PLAIN) for part in held):
+        if isinstance(held, (set, frozenset)) and all(map(_simple, held)):
             return type(held), *sorted((type(part).__name__, repr(part)) for part in held)
         if isinstance(held, os._Environ):
             return "environ", *sorted(held.items())
         if isinstance(held, types.SimpleNamespace) or _plain_python(held):
-            self.boxes[id(held)] = held
+            self.box(held)
             return type(held), self.kind(type(held)), *((name, self.value(part)) for name, part in attributes(held).items())
         self.unknown.append(held)
         return Same(held)
@@ -215,6 +248,11 @@ def _bound(held: object) -> bool:
 def _descriptor(held: object) -> bool:
     """Return True for what C makes of a class's body, such as the fields of a named tuple."""
     return hasattr(type(held), "__get__") and type(held).__module__ in ("builtins", "_collections", "functools")
+
+
+def _simple(held: object) -> bool:
+    """Return True for what its text tells wholly."""
+    return isinstance(held, PLAIN) or (isinstance(held, (tuple, frozenset)) and all(map(_simple, held)))
 
 
 def _plain_python(held: object) -> bool:

@@ -83,8 +83,9 @@ class Remembered(Generic[T]):
                     with np.errstate(all="ignore"):
                         play()
                 parameters = Parameters(held)
-                contents = contents or parameters.contents()
+                contents = contents or parameters.own_contents()
                 if parameters.unknown:
+                    contents.put_back()
                     return Untraced(f"somebody's code reads {parameters.unknown}: keep what changes in the state that start returns")
                 key = None if parameters.key is None else (form, parameters.key)
                 if found := self._find(key, parameters):

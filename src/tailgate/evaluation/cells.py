@@ -223,7 +223,7 @@ def _sparing() -> Iterator[None]:
         return
     except InputError:
         raise
-    except Exception:
+    except (Exception, SystemExit):
         return
 
 

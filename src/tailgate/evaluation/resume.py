@@ -77,6 +77,8 @@ class Parts:
     def __enter__(self) -> Parts:
         self.lock.__enter__()
         try:
+            if self.folder.is_symlink():
+                raise InputError("out", str(self.folder), "a folder of its own, no link")
             writable_directory(self.folder, asked=self.out)
             for place in (self.out, self.folder):
                 sweep(place)

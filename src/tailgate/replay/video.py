@@ -12,7 +12,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from tailgate.base.errors import InputError
+from tailgate.base.errors import InputError, NotWritable
 from tailgate.base.files import replacing, writable_directory, write_atomic
 from tailgate.board.words import names_of
 from tailgate.core import Array
@@ -91,17 +91,25 @@ def _write_mp4(pictures: Iterator[Array], path: Path, rate: float) -> None:
 
     first = next(pictures)
     writable_directory(path.parent, "video")
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".film-") as folder:
         film = Path(folder) / "film.mp4"  # the encoder needs a seekable file
         size = (first.shape[1], first.shape[0])
         options: dict[str, Any] = {"codec": "libx264", "quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
         encoder = imageio_ffmpeg.write_frames(str(film), size, fps=rate, **options)
         encoder.send(None)
-        picture = first
-        for picture in chain([first], pictures):
-            encoder.send(picture.tobytes())
-        for _ in range(round(HOLD * rate)):
-            encoder.send(picture.tobytes())
-        encoder.close()
+        picture, count = first, 0
+        try:
+            for picture in chain([first], pictures):
+                encoder.send(picture.tobytes())
+                count += 1
+            for _ in range(round(HOLD * rate)):
+                encoder.send(picture.tobytes())
+                count += 1
+            encoder.close()
+            kept = imageio_ffmpeg.count_frames_and_secs(str(film))[0]  # the encoder does not tell that it failed
+        except (OSError, RuntimeError):
+            kept = 0
+        if kept < count:
+            raise NotWritable("video", str(path), f"room for a film of {count} frames")
         with film.open("rb") as whole, replacing(path, "video") as file:
             shutil.copyfileobj(whole, file)

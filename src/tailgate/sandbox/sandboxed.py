@@ -11,11 +11,12 @@ import functools
 import weakref
 from dataclasses import dataclass, field
 
+from tailgate.base.errors import InputError
 from tailgate.core import Array, Estimate, Model, Prior, Received
 from tailgate.core.draws import Draws
 from tailgate.core.registry import Entry
 from tailgate.sandbox.isolated import Isolated, IsolatedPlan, Tickets
-from tailgate.sandbox.limits import Limits
+from tailgate.sandbox.limits import Limits, Lost
 from tailgate.sandbox.process import Process
 from tailgate.sandbox.sandbox import sandbox_of
 from tailgate.sandbox.source import staged
@@ -25,9 +26,12 @@ WHITE = "a submission's state stays in its own process: white-box attacks cannot
 
 @functools.lru_cache(maxsize=64)
 def entry_of(program: str, text: str) -> Entry:
-    """Return the entry of a class from a process in the sandbox; raise Lost if that fails."""
-    with staged(text) as source, Process(source.text, source.path, Limits(), sandbox_of(program)) as process:
-        return Entry("defence", f"{program}/{source.text}", Sandboxed, **process.card)
+    """Return the entry of a class from a process in the sandbox; raise InputError if that fails."""
+    try:
+        with staged(text) as source, Process(source.text, source.path, Limits(), sandbox_of(program)) as process:
+            return Entry("defence", f"{program}/{source.text}", Sandboxed, **process.card)
+    except Lost as why:
+        raise InputError("defence", f"{program}/{text}", f"a class that its process can load and make ({why})") from None
 
 
 def digest_of(text: str) -> str:

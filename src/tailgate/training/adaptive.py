@@ -156,8 +156,9 @@ def train_against(configs: list[train.TrainConfig], progress: Progress) -> list[
     runs = []
     for config in configs:
         held = config.directory / "config.json"
-        config = train.as_begun(config, held)
-        again = held.is_file() and train.is_training(config, held)
+        begun = train.as_begun(config, held)
+        again = held.is_file() and train.is_training(begun, held)
+        config = begun if again else config
         if not (again and all(path.is_file() and path.with_suffix(".safetensors").is_file() for path in policies_of(config))):
             runs.append((config, again))
 

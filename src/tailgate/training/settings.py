@@ -37,6 +37,8 @@ def check_folder(out: str, name: str) -> None:
     if not name or name == ".." or Path(name).name != name:
         raise InputError("config.name", name, "the name of a directory, without a separator")
     for field, text in (("config.name", name), ("config.out", out)):
+        if not text.isprintable():
+            raise InputError(field, text, "characters that can be printed")
         if ":" in text:
             raise InputError(field, text, "no colon: in the name of an attack, parameters follow a colon")
 

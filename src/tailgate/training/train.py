@@ -238,6 +238,8 @@ def _teacher(config: TrainConfig, chosen: dict[str, str | None]) -> str | None:
     asked = canonical([as_data(rivals), config.threat, outcome_of(config)])
     if asked not in chosen:
         chosen[asked] = best_of(rivals, dict(config.threat), outcome_of(config), "tune", config.workers)
+    if chosen[asked] is None:
+        raise InputError("config.teacher", "best", "a rival that can act here")
     return chosen[asked]
 
 

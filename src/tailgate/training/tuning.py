@@ -31,7 +31,7 @@ import yaml
 from tailgate.agents.learners.learning import Progress, learner_of
 from tailgate.agents.policy.network_policy import PolicyAttack
 from tailgate.base import sizes
-from tailgate.base.errors import InputError, said, unknown
+from tailgate.base.errors import InputError, Killed, NotWritable, said, unknown
 from tailgate.base.files import writable_directory, write_atomic, write_json
 from tailgate.base.locks import alone
 from tailgate.base.pool import apart, each
@@ -95,7 +95,7 @@ class Search:
     def trained(self) -> TrainConfig:
         """The training of a trial: a seed that the run with the best parameters does not use, and no more than the trial needs."""
         rivals = self.base.rivals if self.base.teacher is not None else ()
-        seed = self.base.first_seed + APART
+        seed = self.base.first_seed + max(APART, self.base.seeds)
         one = dataclasses.replace(self.base, first_seed=seed, seeds=1, workers=1, tensorboard=False)
         return dataclasses.replace(one, rivals=rivals, white_box=(), others=())
 
@@ -271,6 +271,8 @@ def _trial(search: Search, ordinal: int, report: Callable[[int, Progress | None]
         value = objective(config, policy, search.episodes)
         if not np.isfinite(value):
             raise InputError("outcome", value, "a metric that every episode has")
+    except (NotWritable, Killed):
+        raise
     except InputError as error:
         trial.set_user_attr("reason", str(error))
         study.tell(trial, state=module.trial.TrialState.FAIL)

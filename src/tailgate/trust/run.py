@@ -70,7 +70,10 @@ def play(jobs: Sequence[Job], folder: Path | None = None, workers: int = 1, prog
     done: dict[str, Row] = {}
     parts = out = None
     if folder is not None:
-        out, parts = writable_directory(folder) / ROWS, writable_directory(folder / f".{ROWS}.parts")
+        out, parts = writable_directory(folder) / ROWS, folder / f".{ROWS}.parts"
+        if parts.is_symlink():
+            raise InputError("out", str(parts), "a folder of its own, no link")
+        writable_directory(parts)
         for place in (out, parts):
             sweep(place)
         kept = [row for path in (out, *sorted(parts.glob("*.json"))) for row in _read(path)]
@@ -87,14 +90,24 @@ def play(jobs: Sequence[Job], folder: Path | None = None, workers: int = 1, prog
                 progress(len(done), len(set(ids)))
     rows = [done[i] for i in ids]
     if out is not None and parts is not None:
-        if out.is_file() and any(row["cell"] not in ids for row in _read(out)):  # somebody's result
-            set_aside(out)
+        if out.is_file() and (_damaged(out) or any(row["cell"] not in ids for row in _read(out))):  # somebody's result
+            for other in (out, out.with_name(FAILURES), out.with_name(REPORT)):
+                if other.is_file():
+                    set_aside(other)
         write_atomic(out, encode(rows))
         for i in ids:
             remove(parts / f"{i}.json")
         if not any(parts.iterdir()):
             parts.rmdir()
     return rows
+
+
+def _damaged(path: Path) -> bool:
+    """Return True for a file that is not all rows of such a run."""
+    try:
+        return len(_read(path)) < len(list(lines_of(path)))
+    except (OSError, ValueError):
+        return True
 
 
 def _read(path: Path) -> list[Row]:
