@@ -16,7 +16,7 @@ from tailgate.core.schema import as_data
 from tailgate.evaluation.baselines import left_out
 from tailgate.evaluation.cells import evaluate
 from tailgate.training import train as training
-from tailgate.training.adaptive import asked_of, configs_of, fitting, plan_of, train_against
+from tailgate.training.adaptive import as_begun, asked_of, configs_of, fitting, plan_of, train_against
 from tailgate.training.train import train
 
 PLAN = {
@@ -160,7 +160,7 @@ def test_a_run_of_before_the_horizon_was_an_end_goes_on_as_it_was(tmp_path: Path
     config.directory.mkdir()
     write_json(config.directory / "config.json", earlier)
     assert not training.is_training(config, config.directory / "config.json")
-    begun = training.as_begun(config, config.directory / "config.json")
+    begun = as_begun(config, config.directory / "config.json")
     assert not begun.horizon_ends and training.is_training(begun, config.directory / "config.json")
     assert training.plan_key(earlier) == training.plan_key(as_data(config)) == training.plan_key(as_data(begun))
     assert not training.load_config("gusty", [f"out={tmp_path}", "name=old"], resume=True).horizon_ends

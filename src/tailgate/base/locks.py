@@ -75,7 +75,7 @@ def _taken(place: Path, field: str) -> int | None:
         with contextlib.suppress(OSError):
             there = os.stat(path, follow_symlinks=False).st_ino
         if there == os.fstat(handle).st_ino:
-            with contextlib.suppress(OSError):  # a full disk, or the file of another user: who holds it is not told then
+            with contextlib.suppress(OSError):  # a full disk, or the file of another user: nobody learns who holds it then
                 os.ftruncate(handle, 0)
                 os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
             return handle
@@ -93,13 +93,13 @@ def _opened(path: Path, field: str) -> int:
             continue
         except OSError as error:
             if error.errno == errno.ELOOP:
-                raise InputError(field, str(path), "a file of its own, no link") from None
+                raise InputError(field, str(path), "a file that is no link") from None
             raise
         found = os.fstat(handle)
         if stat.S_ISREG(found.st_mode) and found.st_nlink <= 1:
             return handle
         os.close(handle)
-        raise InputError(field, str(path), "a file of its own, with no other name")
+        raise InputError(field, str(path), "a file with one name, no link")
     raise AssertionError("one of both is opened, or raises")
 
 

@@ -78,7 +78,7 @@ class Parts:
         self.lock.__enter__()
         try:
             if self.folder.is_symlink():
-                raise InputError("out", str(self.folder), "a folder of its own, no link")
+                raise InputError("out", str(self.folder), "a folder that is no link")
             writable_directory(self.folder, asked=self.out)
             for place in (self.out, self.folder):
                 sweep(place)

@@ -8,6 +8,7 @@ standard attack ensemble instead (`tailgate.board.searched`).
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from tailgate.agents.learners.learning import LEARNERS, learner_of
 from tailgate.agents.learners.learning import Progress as Now
 from tailgate.base import sizes
 from tailgate.base.errors import InputError, unknown
+from tailgate.base.reading import load_json
 from tailgate.base.sizes import Seeds
 from tailgate.core import PositiveCount, param
 from tailgate.core.registry import Spec
@@ -151,12 +153,21 @@ def policies_of(config: train.TrainConfig) -> list[Path]:
     return [config.directory / f"policy-{seed}.json" for seed in train.training_seeds(config)]
 
 
+def as_begun(config: train.TrainConfig, held: Path) -> train.TrainConfig:
+    """Return a configuration with the horizon of the run that a file holds, so that all its policies are trained alike."""
+    try:
+        before = load_json(held, strict=False)
+        return dataclasses.replace(config, horizon_ends=bool(before.get("horizon_ends", train.LATER["horizon_ends"])))
+    except (OSError, ValueError, AttributeError):
+        return config
+
+
 def train_against(configs: list[train.TrainConfig], progress: Progress) -> list[Path]:
     """Return the policies of all trainings, in their order. A finished one is not trained again, and one that was interrupted goes on."""
     runs = []
     for config in configs:
         held = config.directory / "config.json"
-        begun = train.as_begun(config, held)
+        begun = as_begun(config, held)
         again = held.is_file() and train.is_training(begun, held)
         config = begun if again else config
         if not (again and all(path.is_file() and path.with_suffix(".safetensors").is_file() for path in policies_of(config))):

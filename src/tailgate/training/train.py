@@ -92,10 +92,7 @@ class TrainConfig:
 
 
 def load_config(source: str | None, overrides: list[str], resume: bool = False) -> TrainConfig:
-    """Return a preset by name or YAML file (default: quickstart) with `key=value` overrides.
-
-    With `resume` the configuration that the run of this name was started with takes the preset's place.
-    """
+    """Return a preset by name or YAML file (default: quickstart) with `key=value` overrides; with `resume` the run's own configuration."""
     config = checked(override(_preset(source or BARE), overrides, TrainConfig))
     held = _told(config)
     if not resume:
@@ -360,15 +357,6 @@ def is_training(config: TrainConfig, held: Path) -> bool:
         return _same_training(as_data(config), load_json(held, strict=False))
     except (OSError, ValueError):
         return False
-
-
-def as_begun(config: TrainConfig, held: Path) -> TrainConfig:
-    """Return a configuration with the horizon of the run that a file holds, so that all its policies are trained alike."""
-    try:
-        before = load_json(held, strict=False)
-        return dataclasses.replace(config, horizon_ends=bool(before.get("horizon_ends", LATER["horizon_ends"])))
-    except (OSError, ValueError, AttributeError):
-        return config
 
 
 def plan_key(config: dict[str, Any]) -> str:

@@ -72,7 +72,7 @@ def play(jobs: Sequence[Job], folder: Path | None = None, workers: int = 1, prog
     if folder is not None:
         out, parts = writable_directory(folder) / ROWS, folder / f".{ROWS}.parts"
         if parts.is_symlink():
-            raise InputError("out", str(parts), "a folder of its own, no link")
+            raise InputError("out", str(parts), "a folder that is no link")
         writable_directory(parts)
         for place in (out, parts):
             sweep(place)
