@@ -275,7 +275,7 @@ class _Reader:
     def _leaf(self, values: Array) -> Any:
         """Return the nodes of some numbers."""
         leaf = len(self.values)
-        self.values.append(values.flatten())  # a copy: somebody may write to the array later
+        self.values.append(values.ravel())
         self.key += [values.shape, values.dtype.kind]
         if self.graph is None:
             return [None] * values.size
