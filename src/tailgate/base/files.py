@@ -85,7 +85,7 @@ def replacing(path: Path, field: str = "out") -> Iterator[IO[bytes]]:
 
 def check_regular(path: Path, field: str = "out") -> None:
     """Raise InputError for a device or a pipe: a result would replace it by a file."""
-    if path.exists() and not path.is_file() and not path.is_dir():
+    if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):  # False where a folder may not be searched
         raise InputError(field, str(path), "a regular file, or one that does not exist yet")
 
 
