@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -254,3 +255,15 @@ def test_the_commands(tmp_path, capsys):
 def test_bad_input_is_named_before_anything_is_played(tmp_path, capsys, words, expected):
     assert main([*words, "--out", str(tmp_path / "out")]) == 2
     assert expected in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_the_result_of_another_job_is_set_aside(tmp_path, capsys):
+    """Its counterexample would stand beside the new report."""
+    words = ["falsify", "kf", "--scenario", "braking-v0", "--attack", "none", "--trials", "8", "--out", str(tmp_path / "found"), "--property"]
+    assert main([*words, "G[0,60] gap > 200"]) == 0 and (tmp_path / "found" / "counterexample.json").is_file()
+    shutil.rmtree(tmp_path / "found" / "generations")
+    assert main([*words, "G[0,60] gap > -1000"]) == 0
+    capsys.readouterr()
+    assert not (tmp_path / "found" / "counterexample.json").exists()
+    assert json.loads((tmp_path / "found" / "falsify.json").read_text())["violated"] is False
+    assert json.loads((tmp_path / "found" / "falsify.json.1").read_text())["violated"] is True
