@@ -189,7 +189,7 @@ def play(loop_of, granting):
 
 @pytest.fixture
 def said(monkeypatch):
-    """What is written in the next pictures, as it was meant to be."""
+    """Return the list of texts that the next pictures write."""
     from tailgate.envs.render.canvas import Canvas
 
     words, text = [], Canvas.text

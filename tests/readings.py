@@ -42,7 +42,7 @@ def dense(linear_model, rng, n=3, q=7, Q=1e-6, R=1.0):
 
 
 def sense(radar, d, rows, dv=-5.0, power=0.0, delay=0.0, seed=0, probe=True, reaction=np.inf, step=7):
-    """What the radar reads of a gap d [m] that changes by dv [m/s] in each of `rows` episodes."""
+    """Return the radar's readings of a gap d [m] that changes by dv [m/s], in each of `rows` episodes."""
     model = RadarFollowing().model(radar, RadarCruise())
     truth, one = np.zeros((rows, 1, 4)), np.ones((rows, 1))
     truth[..., 0], truth[..., 1] = d, dv

@@ -1,4 +1,4 @@
-"""What (5.8) and (6.26) have alike: tight bounds between two attacks, and the basin of convergence."""
+"""The filters of (5.8) and (6.26): tight bounds between two attacks, and the basin of convergence."""
 
 import dataclasses
 from typing import NamedTuple

@@ -202,7 +202,7 @@ class Traced(_Base):
         if self.dtype.kind == "f" and not self.fixed and (to.kind == "u" or (to.kind == "i" and to.itemsize < 8)):
             raise Untraceable(f"a float as {to}", "write x.astype(np.int64): numpy's answer to other types depends on the machine")
         if to == self.dtype:
-            return self.copy() if copy else self
+            return self.copy() if copy or self.weak is not None else self
         if self.dtype.kind == "f" and to.kind in "iu" and to != np.int64:  # as numpy does it here
             with np.errstate(invalid="ignore"):
                 return lifted(self.graph, self.values().astype(to))

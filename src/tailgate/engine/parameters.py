@@ -44,12 +44,12 @@ class Snapshot(NamedTuple):
     objects: list[tuple[Any, dict[str, Any]]]  # those that may change, with the contents of their attributes
 
     def changed(self, now: Snapshot) -> str:
-        """Return which object has changed since, by its class and attribute, or that a global has; empty if none."""
+        """Return which object has changed since, by its class and attribute, or that a container or a global has; empty if none."""
         for (one, before), (_, after) in zip(self.objects, now.objects, strict=False):
             for name in after:
                 if before.get(name) != after[name]:
                     return f"{type(one).__name__}.{name}"
-        return "" if self[:2] == now[:2] else "a global"
+        return "" if self[:2] == now[:2] else "a container or a global"
 
 
 class Contents(NamedTuple):
