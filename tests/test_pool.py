@@ -1,6 +1,9 @@
-"""Worker processes multiply matrices in one thread each, unless the user says otherwise."""
+"""Worker processes: how many threads they have, and what happens if one cannot begin."""
 
 import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -22,3 +25,22 @@ def test_workers_have_one_thread_each(given: dict[str, str], monkeypatch: pytest
     found = dict(each(threads, [(name,) for name in THREADS], 1))
     assert [found[0], found[1]] == [given.get("OPENBLAS_NUM_THREADS") or (None if given else "1"), given.get("OMP_NUM_THREADS")]
     assert dict(os.environ) == before
+
+
+UNGUARDED = """
+import os
+from tailgate.base.pool import each
+print(dict(each(os.path.basename, [("a/b",), ("a/c",)], 2)))
+"""
+
+
+def test_a_script_that_starts_workers_in_its_main_module_gets_one_clear_error(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    for text, status in ((UNGUARDED, 1), (UNGUARDED.replace("print", "if __name__ == '__main__': print"), 0)):
+        script.write_text(text)
+        ran = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60)
+        assert ran.returncode == status, ran.stderr
+        if status:
+            assert "workers: got 'a worker that failed at its start, with status 1'; expected a script" in ran.stderr
+        else:
+            assert ran.stdout == "{0: 'b', 1: 'c'}\n" or ran.stdout == "{1: 'c', 0: 'b'}\n"

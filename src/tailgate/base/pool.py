@@ -23,7 +23,7 @@ from multiprocessing import connection, resource_tracker
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 from tailgate.base import own_modules, sizes
-from tailgate.base.errors import Killed
+from tailgate.base.errors import InputError, Killed
 
 R = TypeVar("R")
 ENDING = 5.0  # [s] for an idle worker to end before it is killed
@@ -76,6 +76,7 @@ class _Worker:
     def __init__(self) -> None:
         self.pipe, theirs = multiprocessing.Pipe()
         self.job: int | None = None
+        self.begun = False  # if it has said that it takes jobs
         # a daemon, so that an idle worker does not delay the parent's exit
         self.process = multiprocessing.get_context("spawn").Process(
             target=_serve, args=(theirs, list(sys.path), bool(own_modules.folders())), daemon=True
@@ -88,6 +89,13 @@ class _Worker:
         finally:
             theirs.close()
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+    def check_begun(self) -> None:
+        """Raise InputError if the process, which is gone, failed before it could take a job."""
+        self.process.join(ENDING)
+        if not self.begun and (self.process.exitcode or 0) > 0:
+            wanted = 'a script that starts its work below `if __name__ == "__main__":`; the error of the worker is printed above'
+            raise InputError("workers", f"a worker that failed at its start, with status {self.process.exitcode}", wanted) from None
 
     def end(self, seconds: float) -> None:
         """Close the pipe, which ends an idle worker; kill a worker that still runs after `seconds`."""
@@ -155,7 +163,19 @@ class Crew:
             idle.pipe.send((function, arguments))
 
     def wait(self) -> list[Answer]:
-        """Wait until at least one message arrives; return all that have arrived."""
+        """Wait until at least one message arrives; return all that have arrived.
+
+        Raises
+        ------
+        InputError
+            A worker cannot begin, such as by the main module of a script that starts workers itself.
+        """
+        found: list[Answer] = []
+        while not found:
+            found = self._arrived()
+        return found
+
+    def _arrived(self) -> list[Answer]:
         found = []
         held = {worker.pipe: worker for worker in self.busy}
         for pipe in connection.wait(list(held)):
@@ -166,8 +186,12 @@ class Crew:
                 word, value = worker.pipe.recv()
             except (EOFError, ConnectionError):
                 self.workers.remove(worker)
+                worker.check_begun()
                 worker.end(0.0)
                 found.append(Answer(job, "died"))
+                continue
+            if word == "begun":
+                worker.begun = True
                 continue
             if word != "said":
                 worker.job = None
@@ -261,6 +285,7 @@ def _serve(pipe: connection.Connection, path: list[str], own: bool) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _line = pipe
     with contextlib.suppress(EOFError, ConnectionError):
+        pipe.send(("begun", None))
         while True:
             _answer(pipe)
 
