@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -158,7 +158,7 @@ class Process:
             if left <= 0.0:
                 spent = self.waited + wait
                 self.lose(f"silence: no answer for {wait:g} s" if wait < allowed else f"too slow: {spent:.1f} s of waiting in all")
-            ready, _, _ = select.select([self.answer_fd, report], [], [], left)
+            ready = _readable([self.answer_fd, report], left)
             if self.answer_fd in ready:
                 part = os.read(self.answer_fd, LINE)
                 self.buffer += part
@@ -178,8 +178,7 @@ class Process:
         """Return why the guard ended the process."""
         assert self.guard.stdin is not None and self.guard.stdout is not None
         why, printed = "", ""
-        ready, _, _ = select.select([self.guard.stdout], [], [], 2.0)
-        if not ready:  # the child closed its pipe but still runs
+        if not _readable([self.guard.stdout.fileno()], 2.0):  # the child closed its pipe but still runs
             why = "it closed its pipe"
         else:
             with suppress(ValueError, KeyError, TypeError):
@@ -237,6 +236,14 @@ class Process:
     def __del__(self) -> None:
         with suppress(Exception):
             self.close()
+
+
+def _readable(files: Sequence[int], seconds: float) -> list[int]:
+    """Return the files, by their numbers, that can be read or have ended; wait up to `seconds` for one."""
+    poll = select.poll()  # `select.select` knows no file above number 1023
+    for fd in files:
+        poll.register(fd, select.POLLIN)
+    return [fd for fd, _ in poll.poll(1000.0 * seconds)]
 
 
 def _environment(home: str, root: str) -> dict[str, str]:
