@@ -17,6 +17,7 @@ from tailgate.core.schema import as_data, fields_of
 from tailgate.play.metrics import METRICS, UNITS
 
 from .docstrings import escaped, markdown, summary
+from .usage import clean_run, usage
 
 TITLES: dict[str, tuple[str, str]] = {
     "defence": ("Defences", "Methods that turn what is received into an estimate, a score and an alarm."),
@@ -33,7 +34,6 @@ TITLES: dict[str, tuple[str, str]] = {
 }
 MANY = 1e9  # a bound from here on only keeps arithmetic finite
 _UNIT = re.compile(r"\s*\[([^\]]+)\]")
-_OPTION = {"defence": "--defence", "attack": "--attack"}
 
 
 def _ranges(schema: dict[str, Any], whole: dict[str, Any]) -> Iterator[str]:
@@ -101,34 +101,6 @@ def described(directive: str, name: str, module: str, body: str, fence: str = "`
     return [f"{fence}{{py:{directive}}} {name}", f":module: {module}", *options, "", body, fence, ""]
 
 
-def _usage(entry: Entry, scenarios: list[str]) -> list[str]:
-    name, at = entry.name, scenarios[0] if scenarios else ""
-    if entry.family == "defence":
-        place = at or "gusty-stop-and-go-v0"
-        return [
-            "```console", f"tailgate evaluate --scenario {place} --defence {name} --attack none --seeds 5 --out rows.jsonl", "```", "",
-            "```python", "import tailgate", "", f'defence = tailgate.make_defence("{name}")', "```", "",
-        ]  # fmt: skip
-    if entry.family == "attack":
-        if name in ("policy", "program", "rules", "zoo"):
-            text = {"policy": "runs/quickstart/policy-0.json", "program": "program.yaml", "rules": "rules:path=rules.json", "zoo": "zoo:name=NAME"}[name]
-        else:
-            text = name
-        place = at or "gusty-stop-and-go-v0"
-        return [
-            "```console", f"tailgate evaluate --scenario {place} --defence kf --attack {text} --dose 12 --seeds 5 --out rows.jsonl", "```", "",
-        ]  # fmt: skip
-    if entry.family in ("filter", "detector", "mitigation"):
-        return ["```console", f"tailgate evaluate --suite quick-v0 --defence composed:{entry.family}={name} --seeds 5 --out rows.jsonl", "```", ""]
-    if entry.family == "learner":
-        return ["```console", f"python train.py learner={name} name=by-{name}", "```", ""]
-    if entry.family == "reward":
-        return ["```python", "import gymnasium", "", f'env = gymnasium.make("tailgate:tailgate/CarFollowing-v1", reward="{name}")', "```", ""]
-    if at:
-        return ["```python", "from tailgate.core.scenario import load_scenario", "", f'scenario = load_scenario("{at}")', "```", ""]
-    return ["A scenario's file names it:", "", "```yaml", f"{entry.family}: {{name: {name}}}", "```", ""]
-
-
 class Pages:
     """All pages of components, as paths below a folder and their texts."""
 
@@ -181,7 +153,7 @@ class Pages:
         places = self._played(entry)
         held: object = sys.modules[entry.cls.__module__] if entry.family == "learner" else entry.cls  # a module is one algorithm
         text = [f"# {entry.name} ({entry.family})", "", markdown(held), "", "| | |", "|---|---|", *(f"| {k} | {cell(v)} |" for k, v in facts), ""]
-        text += ["## Parameters", "", *_parameters(getattr(held, "Config", entry.cls)), "## Use", "", *_usage(entry, places)]
+        text += ["## Parameters", "", *_parameters(getattr(held, "Config", entry.cls)), "## Use", "", *usage(entry, places)]
         text += self._links("Played in", "scenario", places if entry.family not in ("defence", "attack") else [])
         text += self._links("On the suites", "suite", self._listed(entry))
         text += ["## Class", "", *described("class", entry.cls.__qualname__, entry.cls.__module__, "")]
@@ -216,8 +188,7 @@ class Pages:
             text += ["What defence and attacker do not know, `truth`:", "", "```json", json.dumps(as_data(place.truth)), "```", ""]
         rows = [f"| `{key}` | `{cell(json.dumps(as_data(getattr(place.threat_model, key))))}` |" for key in fields_of(type(place.threat_model))]
         text += ["## Threat model", "", "| field | value |", "|---|---|", *rows, ""]
-        use = ["```console", f"tailgate evaluate --scenario {name} --defence kf --attack none --seeds 5 --out rows.jsonl", "```", ""]
-        text += ["## Use", "", *use]
+        text += ["## Use", "", *clean_run(name)]
         text += self._links("On the suites", "suite", [n for n, suite in self.suites.items() if name in (*suite.scenarios, *suite.robustness)])
         return "\n".join(text)
 
