@@ -30,7 +30,7 @@ args = parser.parse_args()
 torch.set_num_threads(1)
 torch.manual_seed(args.seed)
 envs = gymnasium.make_vec(
-    "tailgate:tailgate/CarFollowing-v0", num_envs=args.envs, autoreset="same_step", scenario="gusty-stop-and-go-v0", defence="chi2_kf",
+    "tailgate:tailgate/CarFollowing-v1", num_envs=args.envs, autoreset="same_step", scenario="gusty-stop-and-go-v0", defence="chi2_kf",
     action="mode", value=-3.0, interval=10, gamma=args.gamma, gap_shaping=0.0, error_shaping=0.0, horizon_ends=True,
     threat={"kinds": ["dos_jam", "fdi"], "fdi_bound": 3.0, "budget": 20},
 )  # fmt: skip

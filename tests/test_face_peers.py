@@ -37,8 +37,21 @@ def test_the_autoreset_mode_is_an_attribute_and_an_argument():
     """By the name, or as Gymnasium's own."""
     for mode in AutoresetMode:
         for given in (mode, mode.name.lower()):
-            env = AdversaryVectorEnv(2, autoreset=given)
-            assert env.autoreset_mode is env.metadata["autoreset_mode"] is mode
+            for word in ("autoreset", "autoreset_mode"):
+                env = AdversaryVectorEnv(2, **{word: given})
+                assert env.autoreset_mode is env.metadata["autoreset_mode"] is mode
+                assert gymnasium.make_vec(CAR, num_envs=2, **{word: given}).unwrapped.autoreset_mode is mode
+    with pytest.raises(InputError, match=r"autoreset_mode: got .*; expected a vector environment"):
+        AdversaryEnv(autoreset_mode="same_step")
+
+
+def test_batches_say_what_they_are():
+    pytest.importorskip("stable_baselines3")
+    from tailgate.envs.gym.sb3 import BatchVecEnv
+    from tailgate.envs.torch import TensorVecEnv
+
+    assert repr(BatchVecEnv(2)) == "BatchVecEnv(AdversaryVectorEnv(num_envs=2))"
+    assert repr(TensorVecEnv(2)) == "TensorVecEnv(AdversaryVectorEnv(num_envs=2), device='cpu')"
 
 
 @pytest.mark.thin(2)

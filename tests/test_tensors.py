@@ -118,6 +118,16 @@ def test_the_example_trains(host_card: HostCard, monkeypatch: pytest.MonkeyPatch
     assert lines[0] == lines[1] and len(lines[0]) > 0 and host_card.launches > 0
 
 
+@pytest.mark.long
+def test_the_example_of_one_file_learns(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    threads = torch.get_num_threads()
+    monkeypatch.setattr(sys, "argv", ["ppo_one_file.py"])
+    runpy.run_path(str(Path(__file__).parents[1] / "examples" / "ppo_one_file.py"))
+    torch.set_num_threads(threads)
+    shares = [float(line.split("collisions in")[1].split("%")[0]) for line in capsys.readouterr().out.splitlines()]
+    assert shares[0] < 20.0 < shares[-1]
+
+
 @needs_compiler
 def test_nothing_leaves_the_card(host_card: HostCard, monkeypatch: pytest.MonkeyPatch) -> None:
     env = TensorVecEnv(64, device="cuda", **FOLLOWING)

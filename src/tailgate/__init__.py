@@ -56,7 +56,7 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     """Return the names of the package, with those that are imported on first use: `help(tailgate)` lists them."""
-    return sorted({*globals(), "evaluate", "per_episode", "plot"})
+    return sorted({*globals(), "evaluate", "parallel_env", "per_episode", "plot"})
 
 
 def _register() -> None:
