@@ -3,6 +3,7 @@
 import ast
 import inspect
 import io
+import json
 import re
 import tokenize
 from pathlib import Path
@@ -26,7 +27,8 @@ CODE = re.compile(r"`[^`\n]*`")  # names of the code
 QUOTED = re.compile(r'"[^"]*"')
 WORD = re.compile(r"(?<!\S)[A-Za-z'`-]+[,;:.]*(?!\S)")  # parts of formulas do not count
 MOST = 25  # words in a sentence
-PAGES = ["README.md", "CONTRIBUTING.md"]
+PAGES = ["README.md", "CONTRIBUTING.md", "SECURITY.md"]
+TEMPLATES = [path for path in SOURCE.rglob("*.html") if path.relative_to(SOURCE).parts[0] not in TOP]
 PAGES += [str(path.relative_to(ROOT)) for folder in ("docs", "docs/results") for path in (ROOT / folder).glob("*.md")]
 FILES = {str(path.relative_to(SOURCE)): path for path in SOURCE.rglob("*.py") if path.relative_to(SOURCE).parts[0] not in TOP}
 FILES |= {str(path.relative_to(ROOT)): path for folder in TOP for path in (ROOT / folder).rglob("*.py")}
@@ -99,8 +101,37 @@ def test_the_dialect_is_found(text: str) -> None:
 
 def test_prose_of_pages_is_plain() -> None:
     sentences = [(name, part) for name in sorted(PAGES) for part in _prose((ROOT / name).read_text(encoding="utf-8"))]
-    found = [at for at in sentences if OPENINGS.match(at[1]) or DIALECT.search(QUOTED.sub("", at[1])) or len(WORD.findall(at[1])) > MOST]
+    found = [at for at in sentences if _is_dialect(at[1])]
     assert found == [], "plain words: see docs/glossary.md"
+
+
+def _shown(page: str) -> list[str]:
+    """Return the sentences that a template of a page shows; headings and values are no prose."""
+    page = re.sub(r"(?s)\{#.*?#\}|<!--.*?-->|<(script|style|summary|nav|h\d)\b.*?</\1>", "\n\n", page)
+    page = re.sub(r"(?s)\{%-?\s*(?:el(?:if|se)|if|for|end(?:if|for))\b.*?%\}", "\n\n", page)  # between alternatives a sentence ends
+    page = re.sub(r"(?s)\{\{.*?\}\}", "0", re.sub(r"(?s)\{%.*?%\}", "", page))
+    page = re.sub(r"<(?!/?(?:a|b|em|i|code)\b)[^>]*>", "\n\n", page)
+    return [" ".join(part.split()) for part in re.split(r"(?<=[.?!])\s+|\n\s*\n", re.sub(r"<[^>]*>", "", page)) if part.strip()]
+
+
+def test_what_templates_show_is_found() -> None:
+    page = "<h2>What it is</h2><p>One <b>word</b>. {% if x %}Of {{ x|y }} <i>it</i>{% else %}nothing{% endif %}</p><style>Of</style>"
+    assert _shown(page) == ["One word.", "Of 0 it", "nothing"]
+
+
+def test_prose_of_templates_and_notebooks_is_plain() -> None:
+    texts = {path.name: _shown(path.read_text(encoding="utf-8")) for path in TEMPLATES}
+    for path in (ROOT / "docs/tutorials").glob("*.ipynb"):
+        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+        texts[path.name] = [part for cell in cells if cell["cell_type"] == "markdown" for part in _prose("".join(cell["source"]))]
+    assert len(TEMPLATES) > 8 and len(texts) > len(TEMPLATES) + 4
+    found = [(name, part) for name, parts in texts.items() for part in parts if _is_dialect(part)]
+    assert found == [], "plain words: see docs/glossary.md"
+
+
+def _is_dialect(sentence: str) -> bool:
+    long = len(WORD.findall(sentence)) > MOST
+    return bool(OPENINGS.match(sentence) or DIALECT.search(QUOTED.sub("", sentence)) or long)
 
 
 def test_the_glossary_is_in_order() -> None:

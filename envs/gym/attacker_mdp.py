@@ -30,6 +30,10 @@ FACES: dict[str, dict[str, Any]] = {  # defaults of each id
     "tailgate/LaneKeeping-v0": {"scenario": "lane-keeping-v0", "defence": "chi2_kf", "value": 0.5},
     "tailgate/Highway-v0": {"scenario": "highway-v0", "defence": "chi2_kf"},
 }
+OTHERS = (  # arguments of environments that are no options of actions and rewards
+    "scenario", "defence", "threat", "knowledge", "frames", "engine", "render_mode", "viewer", "size", "max_episode_steps", "autoreset",
+    "autoreset_mode", "device", "threads",
+)  # fmt: skip
 RETURN = {"gap_shaping", "error_shaping", "horizon_ends"}  # options that go with a reward that is given as an object, too
 _LEARN: dict[str, Any] = {"error_shaping": 0.0, "gap_shaping": 0.0}
 FACES |= {  # tasks that are worth learning: a budget, decisions that last, no shaping
@@ -147,8 +151,7 @@ class Seat:
         for key in options:
             if key not in known:
                 hint = f"threat={{{key!r}: {options[key]!r}}}, or " if key in fields_of(ThreatModel) else ""
-                others = ("scenario", "defence", "threat", "knowledge", "frames", "engine", "render_mode", "viewer", "size")
-                raise UnknownArgument(key, [*known, *others], hint)
+                raise UnknownArgument(key, [*known, *OTHERS], hint)
         for key in threat:
             if key not in fields_of(ThreatModel):
                 raise unknown("threat: unknown field", key, fields_of(ThreatModel))

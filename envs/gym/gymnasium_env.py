@@ -34,7 +34,10 @@ _AUTORESET = {"next_step": AutoresetMode.NEXT_STEP, "same_step": AutoresetMode.S
 
 
 class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Array]):
-    """B adversary environments stepped as one batch; arguments as `Seat.make`, viewer, size as `Viewer`, engine as `batches`."""
+    """B adversary environments stepped as one batch; arguments as `Seat.make`, viewer, size as `Viewer`, engine as `batches`.
+
+    autoreset: next_step, same_step or disabled; `autoreset_mode` is Gymnasium's word for it.
+    """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own annotation
         "render_modes": ["rgb_array"], "render_fps": 10, "autoreset_mode": AutoresetMode.NEXT_STEP,
@@ -47,6 +50,7 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
         device: str | None = None, **arguments: Any,
     ) -> None:  # fmt: skip
         num_envs = sizes.check("num_envs", num_envs)
+        autoreset = arguments.pop("autoreset_mode", autoreset)
         autoreset = autoreset.name.lower() if isinstance(autoreset, AutoresetMode) else autoreset
         if autoreset not in _AUTORESET:
             raise unknown("autoreset", autoreset, _AUTORESET)
@@ -263,8 +267,9 @@ class AdversaryEnv(Specified, gymnasium.Env[Array, Any]):
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's own annotation
 
     def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
-        if "autoreset" in arguments:
-            raise InputError("autoreset", arguments["autoreset"], "a vector environment (make_vec); a single one is reset by its user")
+        for name in ("autoreset", "autoreset_mode"):
+            if name in arguments:
+                raise InputError(name, arguments[name], "a vector environment (make_vec); a single one is reset by its user")
         if arguments.get("device") not in (None, "cpu"):
             raise InputError("device", arguments["device"], "cpu, or a vector environment (make_vec)")
         arguments["device"] = "cpu"  # a card plays many episodes, not one

@@ -32,6 +32,9 @@ class BatchVecEnv(VecEnv):
         self._actions: Array = np.zeros(0)
         self._returns, self._lengths, self._crashed = np.zeros(num_envs), np.zeros(num_envs, np.int64), np.zeros(num_envs, bool)
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.batch!r})"
+
     def reset(self) -> Array:
         options = self._options[0] or None
         self._reset_options()

@@ -55,6 +55,9 @@ class TensorVecEnv:
             assert isinstance(program, CudaProgram)
             self.device = torch.device(program.card.tensors)
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.env!r}, device={str(self.device)!r})"
+
     def card(self) -> dict[str, Any]:
         """Return JSON data that names this environment completely, with a hash."""
         return self.env.card()
