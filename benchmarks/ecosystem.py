@@ -43,14 +43,15 @@ class Library(NamedTuple):
     extra: bool = False
     torch: bool = True
     file: str = ""  # a file that the snippet needs, by its address; one that DIR holds already is used again
+    learns: float = 0.0  # collisions in percent of the episodes that a recipe has to reach; random actions: about 7
 
 
 LIBRARIES = {
     "Gymnasium": Library((OWN,), (), True, False),
     "Stable-Baselines3": Library((f"{OWN}[train]",), ("stable-baselines3", "torch"), True),
     "rl-zoo3": Library((OWN, "rl_zoo3>=2.9"), ("rl_zoo3", "stable-baselines3", "torch")),
-    "CleanRL": Library((OWN, "tyro", "tensorboard"), ("torch", "tyro", "tensorboard"), file=f"{CLEANRL}/ppo.py"),
-    "TorchRL": Library((f"{OWN}[torchrl]",), ("torchrl", "tensordict", "torch"), True),
+    "CleanRL": Library((OWN, "tyro", "tensorboard"), ("torch", "tyro", "tensorboard"), file=f"{CLEANRL}/ppo.py", learns=60.0),
+    "TorchRL": Library((f"{OWN}[torchrl]",), ("torchrl", "tensordict", "torch"), True, learns=60.0),
     "RLlib": Library((OWN, "ray[rllib]>=2.60"), ("ray", "torch")),
     "PettingZoo": Library((f"{OWN}[game]",), ("pettingzoo",), True, False),
     "Minari": Library((OWN, "minari[hdf5,create]>=0.5"), ("minari",), False, False),
@@ -128,7 +129,15 @@ def tried(name: str, scratch: Path) -> dict[str, Any]:
         except subprocess.TimeoutExpired:
             code, out, err = 1, "", f"not done after {LIMIT} s"
     entry |= {"seconds": round(time.perf_counter() - began, 1), "passed": code == 0}
+    if code == 0 and (share := reached(out)) < library.learns:
+        return entry | {"passed": False, "printed": "", "error": f"learned {share:g} % collisions, expected {library.learns:g} % or more"}
     return entry | {"printed": last(out.splitlines()) if code == 0 else "", "error": last(err.splitlines()) if code else ""}
+
+
+def reached(printed: str) -> float:
+    """Return the share of collisions that a recipe prints, in percent; 0 where it prints none."""
+    share = re.search(r"(\d+) % of (?:the last )?\d+ episodes", printed)
+    return 0.0 if share is None else float(share[1])
 
 
 def table(record: list[dict[str, Any]]) -> str:

@@ -51,6 +51,11 @@ def test_package_data_covers_every_data_file() -> None:
         assert data == matched, name
 
 
+def test_the_description_for_an_index_links_to_nothing_that_it_lacks() -> None:
+    page = (ROOT / CONFIG["project"]["readme"]).read_text(encoding="utf-8")
+    assert re.findall(r"\]\((?!https?://|#)[^)]*\)|<img", page) == [] and "pip install" in page
+
+
 def test_one_version_is_said_everywhere() -> None:
     """The package, how to cite it, and the newest release of the changelog, with one date; above that is what is not released."""
     released = re.findall(r"^## \[(.+?)\](?: - (\S+))?$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), flags=re.M)
