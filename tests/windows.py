@@ -23,8 +23,8 @@ def window(rng, s, T, size, q=7, n=3):
 def problem(rng, trial):
     """A random window of one of KINDS: no noise, noise, one liar, two that lie alike.
 
-    Degenerate ones: rounded data with two equal sensors; readings of 0; a sensor that sees one direction, with one that sees none; two states
-    that nobody tells apart.
+    Degenerate ones: rounded data with two equal sensors; readings of 0; a sensor that sees one direction, with one that sees none;
+    two states that nobody tells apart.
     """
     kind = trial % KINDS
     n, q, T = (int(rng.integers(*ends)) for ends in ((1 + (kind == 7), 4), (3, 9), (1, 6)))
