@@ -41,7 +41,7 @@ def test_the_median():
 
 
 @pytest.mark.thin(4)
-@pytest.mark.parametrize("s, least", [(0, 40), (1, 40), (2, 38), (3, 33)])
+@pytest.mark.parametrize("s, least", [(0, 40), (1, 40), (2, 40), (3, 36)])
 def test_noise_free_recovery(s, least):
     """Seven sensors of three states, 100 randn on s of them: exact, for s = 3 in most cases; the relaxation may fail. A million times the attack changes nothing."""
     exact = 0
@@ -165,11 +165,11 @@ def test_feasible_is_what_a_grid_finds():
 @pytest.mark.long
 @pytest.mark.parametrize("centre", ["least_squares", "chebyshev"])
 def test_honest_errors_within_their_bounds_never_alarm_and_move_the_estimate_by_less_than_the_bound(centre):
-    """250 draws for least squares, 100 for the linear program: nobody is blamed, and |error| <= l0_bound."""
+    """1000 draws: nobody is blamed, and |error| <= l0_bound."""
     O, _, _, _ = window(RNG, 0, 4, 0.0)
     D, there, farthest = np.full((7, 4), 0.1), np.ones((7, 4), bool), 0.0
     bound = bounds.l0_bound(O[0], D, 2)
-    for _ in range(250 if centre == "least_squares" else 100):
+    for _ in range(1000):
         x = RNG.normal(size=3)
         found = explanation(O[0], O[0] @ x + 0.1 * RNG.choice([-1.0, 1.0], size=(7, 4)), D, there, 2, centre)
         assert found.attacked == () and found.found
@@ -239,8 +239,7 @@ def test_bernoulli_on_the_road():
     _, out = play_readings(Bernoulli(attacked=("radar_long", "lidar"), drift=0.1), model, ys)
     state = out[-1][0]
     sd = np.sqrt(state.under.P[:, 0].diagonal(axis1=1, axis2=2)[:, 3:])
-    assert out[-1][1].alarm.all() and (np.abs(state.under.x[:, 0, 3:] - 20.0) < 4.5 * sd).all()
-    assert np.mean(np.abs(state.under.x[:, 0, 3:] - 20.0) < 3.0 * sd) > 0.95
+    assert out[-1][1].alarm.all() and (np.abs(state.under.x[:, 0, 3:] - 20.0) < 3.0 * sd).all()
 
 
 def test_watermark_raises_the_statistic_under_replay():

@@ -8,8 +8,8 @@ from scipy import stats
 
 import tailgate
 from tailgate.base.errors import InputError, NotApplicable
-from tailgate.core import Innovation
-from tailgate.core.draws import keys
+from tailgate.core import Innovation, Model, Prior, Received
+from tailgate.core.draws import Role, keys
 from tailgate.core.reach import sparsity
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
@@ -251,17 +251,36 @@ def test_an_attack_cannot_pull_minimax_beyond_the_honest_readings(linear_model):
     assert out[0] < out[1] < out[2] and out[2] - out[0] <= honest[1] - honest[0]
 
 
-def test_the_worst_case_of_minimax_is_below_that_of_the_mean(linear_model):
-    """Mean squared error under the worst of many replacements of two readings of seven; the plain filter has none."""
-    model = _scalar(linear_model, 7, Q=1.0)
+def _listener(defence, ys):
+    """Estimates (K, B) of an agent without a sensor that hears seven agents, who have one of the readings ys (K, B, 7) each."""
+    graph = np.eye(8, dtype=bool)
+    graph[7] = True
+    C = np.array([1.0] * 7 + [0.0])[:, None, None]
+    model = Model(np.eye(1), np.zeros((1, 1)), np.zeros(1), C, np.eye(1), np.ones((8, 1, 1)), graph, 1.0, ("y",))
+    plan, batch, out = defence.prepare(model), ys.shape[1], []
+    state = defence.start(plan, Prior(np.zeros((batch, 8, 1)), np.ones((batch, 8, 1, 1))))
+    for k, row in enumerate(ys):
+        y = np.concatenate([row, np.zeros((batch, 1))], axis=1)[..., None]
+        draws = keys("train", range(batch)).at(Role.DEFENCE, np.full(batch, k))
+        received = Received(y, np.ones(y.shape, bool), np.zeros((batch, 8)))
+        state, estimate = defence.step(plan, state, received, np.zeros((batch, 8, 1)), draws)
+        out.append(estimate.x[:, 7, 0])
+    return np.array(out)
+
+
+def test_the_worst_case_of_minimax_is_below_those_of_means(linear_model):
+    """Mean squared error under the worst of many replacements of two readings of seven: without trimming, consensus has no bound.
+
+    `trimmed_consensus:faulty=0` plays the car with seven sensors, where it is the plain filter, and a listener to seven cars with one each.
+    """
+    model, means = _scalar(linear_model, 7, Q=1.0), tailgate.make_defence("trimmed_consensus", faulty=0)
     xs, ys = simulated(model, 30, 200, RNG)
-    worst = {}
-    for name, defence in (("minimax", Minimax(attacked=2)), ("kf", tailgate.make_defence("kf", gain="steady"))):
-        errors = []
-        for size in (-1e3, -5.0, -2.0, 2.0, 5.0, 1e3):
-            attacked = ys.copy()
-            attacked[..., :2] = xs + size
-            _, out = play_readings(defence, model, attacked)
-            errors.append(np.mean([(e.x[:, 0] - x) ** 2 for (_, e), x in zip(out[5:], xs[5:], strict=True)]))
-        worst[name] = max(errors)
-    assert worst["minimax"] < 2.0 < worst["kf"]
+    plays = {"minimax": Minimax(attacked=2), "kf": tailgate.make_defence("kf", gain="steady"), "means": means}
+    worst = dict.fromkeys([*plays, "listener"], 0.0)
+    for size in (-1e3, -5.0, -2.0, 2.0, 5.0, 1e3):
+        attacked = ys.copy()
+        attacked[..., :2] = xs + size
+        found = {name: np.array([e.x[:, 0, 0] for _, e in play_readings(defence, model, attacked)[1]]) for name, defence in plays.items()}
+        for name, x in (found | {"listener": _listener(means, attacked)}).items():
+            worst[name] = max(worst[name], np.mean((x[5:] - xs[5:, :, 0]) ** 2))
+    assert worst["means"] == pytest.approx(worst["kf"]) and worst["minimax"] < 2.0 < 1e4 < min(worst["means"], worst["listener"])
