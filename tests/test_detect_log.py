@@ -68,6 +68,13 @@ def test_the_smoother_is_nearer_to_the_truth_than_the_filter():
     assert out[0]["gap_error"] == pytest.approx(filtered.std(), rel=0.35)
 
 
+def test_a_constant_gap_is_smoothed_to_itself():
+    """Its prior is that of the first reading. A prior one step earlier made 30.003 m of the first gap, and -0.0025 m/s of no speed."""
+    t = np.arange(200) / 10.0
+    part = checked(Raw("constant", t, np.full(200, 30.0), np.zeros(200), np.full(200, 20.0)), "file")
+    np.testing.assert_allclose(smoothed(cut(part, Noise(), None))[0], [[30.0, 0.0]] * 200, atol=1e-9)
+
+
 @pytest.mark.long
 def test_a_piece_is_smoothed_alone_as_next_to_a_longer_one():
     long, short = (_recording(seconds=seconds)[0] for seconds in (60.0, 30.0))

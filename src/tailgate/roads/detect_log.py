@@ -80,7 +80,7 @@ def smoothed(held: Cut) -> Array:
         filter_.x = np.array([gap[0], relative[0] + speed[0], 0.0])
         filter_.P = np.diag([1.0, 1.0, 1.0])
         z = [np.array([gap[k] + own[k], relative[k] + speed[k]]) if seen[k] else None for k in range(length)]
-        means, covariances, _, _ = filter_.batch_filter(z)
+        means, covariances, _, _ = filter_.batch_filter(z, update_first=True)
         x = filter_.rts_smoother(means, covariances)[0]
         out[i, :length] = np.stack([x[:, 0] - own, x[:, 1] - speed], axis=1)
     return out
