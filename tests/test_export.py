@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -63,6 +64,29 @@ def test_floating_car_data_is_read_back(tmp_path):
     assert found.dt == pytest.approx(0.05) and found.samples == int(trace.length[0]) + 1
     assert np.abs(part.gap[1:] - trace.signals["gap"][:, 0, 2])[part.seen[1:]].max() < 2e-3 and part.seen[:-1].all()  # the last: a collision
     assert np.abs(part.speed[1:] - trace.signals["speed"][:, 0, 2]).max() < 1e-4
+
+
+@pytest.mark.parametrize("name", ["road-string-v0", "platoon-gusty-v0"])
+def test_floating_car_data_has_the_elements_of_sumo(name):
+    """The standard library reads the elements and attributes that SUMO's page on FCD output names: a step for each row, each car in it."""
+    trace = _trace(name)
+    cars, root = cars_of(trace, 1), ElementTree.fromstring(exported(trace, ".xml", 1))
+    assert root.tag == "fcd-export" and {step.tag for step in root} == {"timestep"} and len(root) == int(trace.length[1]) + 1
+    begin = min(0.0, cars.place.min())
+    for k, step in enumerate(root):
+        assert step.attrib.keys() == {"time"} and float(step.attrib["time"]) == pytest.approx(k * trace.dt, abs=5e-4)
+        assert [(vehicle.tag, vehicle.attrib["id"]) for vehicle in step] == [("vehicle", car) for car in cars.names]
+        for i, vehicle in enumerate(step):
+            held = dict(vehicle.attrib)
+            assert held.keys() == {"id", "x", "y", "angle", "type", "speed", "pos", "lane", "slope", "acceleration"}
+            assert held["lane"] == "road_0" and held["type"] == "car" and held["x"] == held["pos"]
+            assert [float(held[key]) for key in ("y", "angle", "slope")] == [0.0, 90.0, 0.0]  # along x: 0 is north, clockwise
+            assert float(held["pos"]) == pytest.approx(cars.place[k, i] - begin, abs=5.1e-4)
+            assert float(held["speed"]) == pytest.approx(cars.speed[k, i], abs=5.1e-5)
+            assert float(held["acceleration"]) == pytest.approx(cars.accel[k, i], abs=5.1e-5)
+    own = [i for i, car in enumerate(cars.names) if car.startswith("agent")]
+    speeds = np.array([[float(step[i].attrib["speed"]) for i in own] for step in root])
+    assert np.abs(speeds[1:] - trace.signals["speed"][: len(root) - 1, 1]).max() < 5.1e-5 and speeds.min() > 0.0
 
 
 def test_csv_is_read_back(tmp_path):
