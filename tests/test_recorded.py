@@ -14,6 +14,7 @@ from tailgate.core import draws, traces
 from tailgate.core.draws import PURPOSES, Keys, Role
 from tailgate.core.registry import Spec, make, make_from
 from tailgate.core.scenario import load_scenario
+from tailgate.envs.recorded import Recorded
 from tailgate.play.trace import rollout
 
 from .engines import as_plain, loop_of, trace_as_plain
@@ -38,6 +39,15 @@ def test_a_trace_is_the_file_of_its_card(name):
     assert path.name in (ROOT / "NOTICE").read_text(encoding="utf-8")
     assert np.all(np.diff(columns["t"]) > 0) and all(len(x) == len(columns["t"]) and np.isfinite(x).all() for x in columns.values())
     assert all((x >= 0).all() for key, x in columns.items() if key.startswith(("speed", "gap")))
+
+
+def test_the_leader_brakes_hard_in_training_only():
+    """By 3.0 m/s^2 at 709.5 s. The three whole report blocks have 0.3, 0.7 and 1.0 m/s^2 as a mean over 1 s, the end of the drive 1.4."""
+    speed, blocks = Recorded().blocks(0.05)
+    braking = {b.first * 0.05: (b.purpose, np.min(speed[b.first + 20 : b.last + 1] - speed[b.first : b.last - 19])) for b in blocks}
+    assert [round(-most, 1) for purpose, most in braking.values() if purpose == "report"] == [0.3, 0.7, 1.0, 1.4]
+    assert np.argmin(np.diff(speed)) * 0.05 == pytest.approx(709.5) and np.min(np.diff(speed)) / 0.05 == pytest.approx(-3.0)
+    assert min(braking.items(), key=lambda held: held[1][1]) == (pytest.approx(600.25), ("train", pytest.approx(-2.36)))
 
 
 def test_a_string_is_the_leaders_drive():
