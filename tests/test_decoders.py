@@ -13,6 +13,7 @@ from tailgate.estimators.filters.bernoulli import Bernoulli
 from tailgate.estimators.sparse_attacks.l0_robust import RobustDecoder, explanation, feasible
 from tailgate.estimators.sparse_attacks.l1_decoder import L1Decoder
 from tailgate.estimators.sparse_attacks.projected import Etpg, Etpl, orthonormal
+from tailgate.estimators.sparse_attacks.window import centred
 from tailgate.play.trace import rollout
 from tailgate.thesis import bounds
 from tests.readings import dense, play_readings, simulated
@@ -104,6 +105,18 @@ def test_without_attacked_sensors_etpg_is_least_squares_on_the_window(linear_mod
             Y = np.stack([ys[k - 3 : k + 1, :, i] for i in range(7)], axis=1)  # (T, q, B)
             x = np.linalg.lstsq(O, Y.transpose(1, 0, 2).reshape(-1, 5), rcond=None)[0]
             np.testing.assert_allclose(out[k][1].x[:, 0], (plan.window.last @ x).T, atol=1e-8)
+
+
+def test_the_energy_is_above_eps_where_the_rounds_end_the_iteration(linear_model):
+    """A liar of 50: three rounds are not enough in any window, 300 are in all."""
+    model = dense(linear_model, RNG, R=1e-4)
+    _, ys = simulated(model, 8, 10, RNG)
+    ys[..., 2] += 50.0
+    for rounds, over in ((3, True), (300, False)):
+        defence = Etpg(s=1, window=4, rounds=rounds, eps=0.1)
+        plan, out = play_readings(defence, model, ys)
+        for state, _ in out[3:]:
+            assert ((defence.search(plan, None, centred(plan.window, state.window)).energy > plan.own.eps) == over).all()
 
 
 def test_the_share_that_the_paper_needs_is_a_bound_on_random_directions():

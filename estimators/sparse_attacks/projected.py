@@ -150,12 +150,9 @@ class ProjectedGradient(Relaxed):
         agents, q, T, n = plan.own.O.shape
         return ProjectedState(num.zeros((batch, agents, n)), num.zeros((batch, agents, q, T))) if self.warm else None
 
-    def decode(self, plan: DecoderPlan, own: ProjectedState | None, held: Centred) -> tuple[ProjectedState | None, Decoded]:
+    def search(self, plan: DecoderPlan, own: ProjectedState | None, held: Centred) -> Solved:
+        """Return the answer of the iteration for a window, after the memory `own`; its energy is above eps where `rounds` ended it."""
         p: ProjectedPlan = plan.own
-        O = plan.window.O
-        gram, floor = grams(O, held.there), floor_of(O)
-        fitted = least_squares(O, held.Y, gram, np.ones(held.there.shape[:3]), floor)
-        score = energy(np.where(held.there, held.Y - modelled(O, fitted), 0.0))
         scaled = held._replace(Y=held.Y * p.units)
         pull = pulled(p.O, scaled.Y)
         x, E = weighed(np.ones(pull.shape[:3]), pull), np.zeros_like(held.Y)  # least squares of these rows, where all have arrived
@@ -163,8 +160,16 @@ class ProjectedGradient(Relaxed):
             x = num.matvec(p.move, own.x) + num.matvec(p.turn, held.pushed)
             newest = np.where(held.there, scaled.Y - modelled(p.O, x), 0.0)[..., -1:]
             E = np.concatenate([own.E[..., 1:], newest], axis=-1)
+        return solved(p, scaled, x, E, self.s, self.nu, int(self.rounds))
+
+    def decode(self, plan: DecoderPlan, own: ProjectedState | None, held: Centred) -> tuple[ProjectedState | None, Decoded]:
+        p: ProjectedPlan = plan.own
+        O = plan.window.O
+        gram, floor = grams(O, held.there), floor_of(O)
+        fitted = least_squares(O, held.Y, gram, np.ones(held.there.shape[:3]), floor)
+        score = energy(np.where(held.there, held.Y - modelled(O, fitted), 0.0))
         alarm = score > p.threshold
-        found = solved(p, scaled, x, E, self.s, self.nu, int(self.rounds))
+        found = self.search(plan, own, held)
         support = alarm[..., None] & (num.dot(found.E, found.E) > 0.0)
         left = np.where(support, 0.0, 1.0)
         x = least_squares(O, held.Y, gram, left, floor)
