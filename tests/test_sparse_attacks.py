@@ -1,5 +1,6 @@
 """Subsets of sensors: which attacks can be corrected, banks of filters, and the minimax filter."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -10,6 +11,7 @@ import tailgate
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Innovation, Model, Prior, Received
 from tailgate.core.draws import Role, keys
+from tailgate.core.kinds import Kind
 from tailgate.core.reach import sparsity
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
@@ -181,6 +183,56 @@ def _against(defence, model, plan, residues, rows):
         ys.append(y)
     _, out = play_readings(defence, model, np.array(ys)[:, None])
     return out[-1][0], out[-1][0].x[0, 0, :, plan.first]
+
+
+class _WorstBlock:
+    """For one block of `kf_bank`, sends a filter the residues (N, q) that are given. The sensors that this one leaves out are far off."""
+
+    knowledge = "white"
+
+    def __init__(self, residues, begin):
+        self.residues, self.begin, self.free = residues, begin, None  # its state without any residue
+
+    def prepare(self, brief):
+        return brief
+
+    def start(self, brief, batch, draws):
+        return None
+
+    def decide(self, brief, state, view, draws):
+        box, j, first = view.defence, int(view.k[0]) - self.begin, view.defence.plan.first
+        bank, on = box.plan.bank, np.full(len(view.k), 0 <= j < len(self.residues))
+        keep, value = bank.keep[first], np.zeros((len(on), 1, len(brief.model.wires)))
+        if on.any():
+            driven = box.known_u[:, 0] @ bank.B.T + bank.c
+            x, before = box.state.x[:, 0, :, first] @ bank.A.T + driven, box.state.x[:, 0, :, first] if j == 0 else self.free
+            self.free = before @ bank.A.T + driven
+            y = np.where(keep, x @ bank.C[0].T + self.residues[j], 1e4 * (1.0 + np.arange(7)))
+            value[:, 0, :7] = y - view.received.y[:, 0]
+        target = np.broadcast_to(np.arange(value.shape[-1]) < 7, value.shape)
+        return state, brief.command(on, Kind.FDI, target, value)
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_a_played_attack_moves_the_believed_filter_by_the_bound_and_no_further(index):
+    """On the road, on all sensors: worst residues are quiet, and move it by `block_bound`. One percent more is rejected."""
+    place = load_scenario("redundant-two-v0")
+    model, defence, direction = place.brief().model, KalmanBank(s=2), np.eye(3)[index]
+    place = place.with_threat(targets=model.sensors, fdi_bound=1e6, knowledge="white", kinds=("fdi",), budget=None, onset=1)
+    plan = defence.prepare(model)
+    rows = np.flatnonzero(plan.bank.keep[plan.first])
+    steady = bounds.updated(plan.bank.before[0, plan.first], model.C[0][rows], model.R[0][np.ix_(rows, rows)])
+    most = bounds.block_bound(model.A, steady, plan.threshold, defence.block, direction)
+    worst = np.zeros((defence.block, 7))
+    worst[:, rows] = bounds.block_residues(model.A, steady, plan.threshold, defence.block, direction)
+    for share, quiet in ((1.0 - 1e-9, True), (0.5, True), (1.01, False)):
+        attack = _WorstBlock(share * worst, 51)
+        trace = rollout(dataclasses.replace(place, horizon=60).loop(defence), attack, keys("train", range(3)))
+        assert (trace.kind[50:60] == Kind.FDI).all() and (trace.alarm[59] != quiet).all()
+        if quiet:
+            moved = (trace.estimate[59, :, 0] - attack.free) @ direction
+            np.testing.assert_allclose(np.abs(moved), share * most, rtol=1e-6)
+            np.testing.assert_allclose(trace.score[59, :, 0], share * share * plan.threshold, rtol=1e-6)
 
 
 def test_observers_of_a_static_scalar(linear_model):
