@@ -22,7 +22,7 @@ def pages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def play(lines: str) -> int:
-    """Play the blocks of a text, each command with one episode; return how many there were."""
+    """Play the blocks of a text, each command with one episode, a suite's without an attack; return how many there were."""
     blocks = BLOCK.findall(lines)
     for kind, text in blocks:
         if kind == "python":
@@ -31,6 +31,7 @@ def play(lines: str) -> int:
         for line in text.splitlines():
             words = shlex.split(line.replace("--seeds 5", "--seeds 1"))
             assert words[0] == "tailgate" and "--seeds" in words, line
+            words += [] if "--attack" in words else ["--attack", "none"]
             assert main([*words[1:], "--quiet"]) == 0, line
             Path("rows.jsonl").unlink()
     return len(blocks)
