@@ -9,6 +9,7 @@ from scipy.optimize import linprog
 import tailgate
 from tailgate.estimators.sparse_attacks.l0_robust import explanation
 from tailgate.estimators.sparse_attacks.l1_decoder import grouped, programmed
+from tests import mixed_integer
 from tests.mixed_integer import excess, reach, solve_milp
 from tests.readings import dense, play_readings
 from tests.windows import KINDS, objective, problem, projected, solve, window
@@ -105,13 +106,11 @@ def test_the_mixed_integer_program_finds_large_lies_and_lost_readings():
 
 def test_the_mixed_integer_program_checks_its_set(monkeypatch):
     """A slack of HiGHS times a constant of 1e6 once blamed sensor 2, which explains nothing. Even such constants are corrected now."""
-    from tailgate.estimators.sparse_attacks import l0_robust
-
     O = np.array([[[-2.0, -1.0]], [[1.0, -1.0]], [[2.0, 0.0]], [[-1.0, 2.0]]])
     Y, D, there = np.array([[5.0], [0.0], [0.0], [0.0]]), np.full((4, 1), 0.1), np.ones((4, 1), bool)
     assert _explaining(O, Y, D, 1) == [(0,)]
     assert solve_milp(O, Y, D, there) == explanation(O, Y, D, there, 1).attacked == (0,)
-    monkeypatch.setattr(l0_robust, "reach", lambda rows, *rest: np.full(len(rows), 1e6))
+    monkeypatch.setattr(mixed_integer, "reach", lambda rows, *rest: np.full(len(rows), 1e6))
     for trial in range(10):
         O, Y, D = _lies(trial)
         there = np.ones(Y.shape, bool)

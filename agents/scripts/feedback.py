@@ -33,7 +33,7 @@ def road(view: View, count: Array, dt: float) -> tuple[Array, ...]:
 
 
 def fed_back(weights: Array, seen: tuple[Array, ...]) -> Array:
-    """Return 0.1 sinh(w . seen), (B, N, w), for weights that broadcast to (B, N, w, FEATURES): small values are as easy to say as large ones."""
+    """Return 0.1 sinh(w . seen), (B, N, w), for weights that broadcast to (B, N, w, FEATURES); sinh has small values and large ones."""
     argument = weights[..., 0] * seen[0][..., None]
     for i in range(1, FEATURES):
         argument = argument + weights[..., i] * seen[i][..., None]
