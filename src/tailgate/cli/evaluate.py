@@ -117,10 +117,11 @@ def _above(rows: list[dict[str, Any]], named: Sequence[str]) -> list[str]:
         granted = {canonical(row["threat_model"]): row["threat_model"] for row in rows if row["attack"] == attack and row["status"] == "ok"}
         made = Spec("attack", attack).make() if granted else None
         for field in getattr(made, "__dataclass_fields__", {}).values():
-            bounds = [threat[field.metadata["cut"]] for threat in granted.values() if field.metadata.get("cut")]
+            cut = field.metadata.get("cut")
+            bounds = [threat.get(cut) for threat in granted.values() if cut]  # a threat model does not write every bound that is none
             for bound in sorted({tuple(bound) if isinstance(bound, list) else (-bound, bound) for bound in bounds if bound is not None}):
                 if not bound[0] <= getattr(made, field.name) <= bound[1]:
-                    out.append(f"{attack}: {field.name} is cut at {field.metadata['cut']}, {bound[0]:g} to {bound[1]:g}")
+                    out.append(f"{attack}: {field.name} is cut at {cut}, {bound[0]:g} to {bound[1]:g}")
     return out
 
 
