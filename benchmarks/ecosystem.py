@@ -136,8 +136,8 @@ def tried(name: str, scratch: Path) -> dict[str, Any]:
 
 def reached(printed: str) -> float:
     """Return the share of collisions that a recipe prints, in percent; 0 where it prints none."""
-    share = re.search(r"(\d+) % of (?:the last )?\d+ episodes", printed)
-    return 0.0 if share is None else float(share[1])
+    shares = re.findall(r"(\d+) % of (?:the last )?\d+ episodes", printed)
+    return float(shares[-1]) if shares else 0.0
 
 
 def table(record: list[dict[str, Any]]) -> str:

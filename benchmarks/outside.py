@@ -5,8 +5,8 @@
 The attacks are those of `feedback`: a trigger, bursts and pauses, a kind, a later kind, and for each wire a feedback of the road.
 So each wire has another value, unlike in the scripts of the ensemble, and there is no hidden layer, unlike in its networks.
 Random attacks of all kinds come first. The best combinations of kinds, wires and triggers are then searched by CMA-ES.
-Each figure of the board that leaves more than 10 % undamaged gets the same time, in the scenario of its worst attack.
-The best attack of a search then meets 2000 fresh episodes.
+Each ranked figure at black box that leaves more than 10 % undamaged gets the same time, in the scenario of its worst attack.
+The best attack of a search then meets 2000 fresh episodes. A faster machine tries more, so the seed alone does not repeat a search.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ class Search:
         return Numbers(weights, target, kind, later, switch, trigger, level, first_step, burst_of, pause)
 
     def scores(self, attacks: list[tuple[Choice, Array]], episodes: int) -> Array:
-        """Return the mean score (A,) of attacks, each over the same episodes, which nobody has played before."""
+        """Return the mean score (A,) of attacks, each over the same tune episodes, which this search plays for the first time."""
         first, self.next = self.next, self.next + episodes
         arena, numbers, total = self.arena, self.numbers(attacks), len(attacks)
         keys, reach = draws.keys("tune", range(first, first + episodes)), arena.reach("tune", first, episodes)
@@ -262,9 +262,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    path = Path(__file__).parents[1] / "results" / args.board / "board.json.xz"
-    suite = load_suite(args.board)
-    todo = figures(json.loads(lzma.decompress(path.read_bytes())))
+    suite, folder = load_suite(args.board), Path(__file__).parents[1] / "results" / args.board
+    packed = folder / "board.json.xz"
+    held = lzma.decompress(packed.read_bytes()) if packed.exists() else (folder / "board.json").read_bytes()
+    todo = figures(json.loads(held))
+    if not todo:
+        parser.error(f"{args.board} has no ranked figure of black box attacks that could fall")
     print(f"{len(todo)} searches of {60 * args.minutes / len(todo):.0f} s")
     print("| defence | dose | scenario | published | found | points | tried | attack |\n| --- | --- | --- | --- | --- | --- | --- | --- |")
     out = []

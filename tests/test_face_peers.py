@@ -43,6 +43,25 @@ def test_the_autoreset_mode_is_an_attribute_and_an_argument():
                 assert gymnasium.make_vec(CAR, num_envs=2, **{word: given}).unwrapped.autoreset_mode is mode
     with pytest.raises(InputError, match=r"autoreset_mode: got .*; expected a vector environment"):
         AdversaryEnv(autoreset_mode="same_step")
+    with pytest.raises(InputError, match=r"autoreset_mode: got 'disabled'; expected none, as autoreset is same_step"):
+        AdversaryVectorEnv(2, autoreset="same_step", autoreset_mode="disabled")
+    for wrong in ("samestep", ["same_step"]):
+        with pytest.raises(InputError, match=r"autoreset_mode: got .*samestep|autoreset_mode: got \['same_step'\]"):
+            AdversaryVectorEnv(2, autoreset_mode=wrong)
+
+
+@pytest.mark.parametrize("word", ["autoreset", "autoreset_mode"])
+def test_wrappers_that_reset_in_one_way_refuse_another(word):
+    pytest.importorskip("stable_baselines3")
+    from tailgate.envs.gym.sb3 import BatchVecEnv
+
+    with pytest.raises(InputError, match=f"{word}: got 'next_step'; expected nothing: Stable-Baselines3"):
+        BatchVecEnv(2, **{word: "next_step"})
+    pytest.importorskip("torchrl")
+    from tailgate.envs.torch import TailgateEnv
+
+    with pytest.raises(InputError, match=f"{word}: got 'next_step'; expected nothing: TorchRL"):
+        TailgateEnv(2, **{word: "next_step"})
 
 
 def test_batches_say_what_they_are():

@@ -56,17 +56,25 @@ def test_over_the_air_a_magnitude_counts() -> None:
     assert there.any() and np.allclose(trace.value[..., 0][there], 0.1 * np.sinh(4.0))
 
 
-@pytest.mark.parametrize("engine", ["gusty-stop-and-go-v0", "platoon-gusty-v0"])
-def test_the_engine_plays_the_same(engine: str) -> None:
+@pytest.mark.parametrize(
+    ("place", "defence", "text"),
+    [
+        ("gusty-stop-and-go-v0", "chi2_kf", "weights.position=[-1,0.3,0.5,-0.4,0.2],trigger=near,threshold=60,burst=2,pause=3"),
+        ("gusty-stop-and-go-v0", "chi2_kf", "kind=dropout,later=dos_jam,switch=4,weights.velocity=[1,0.1,0.2,0.6,-0.7],start_step=60"),
+        ("radar-braking-v0", "kf", "kind=noise_jam,later=echo_delay,switch=3,weights.distance=[-4,0.2,0.4,0.1,-0.4],start_step=20"),
+        ("platoon-gusty-v0", "chi2_dkf", "weights.distance=[-1,0.3,0.5,-0.4,0.2],weights.velocity=[0.4,0,0,0.6,0],start_step=20"),
+    ],
+)
+def test_the_engine_plays_the_same(place: str, defence: str, text: str) -> None:
     """As the plain loop does, with each agent's own road."""
-    attack = Feedback(weights={name: WEIGHTS[key] for name, key in zip(load_scenario(engine).brief().model.sensors, WEIGHTS, strict=False)}, start_step=20)
-    fast = played(engine, attack, "chi2_kf" if "platoon" not in engine else "chi2_dkf")
+    attack = Spec("attack", f"feedback:{text}").make()
+    fast = played(place, attack, defence)
 
     class Plain(Feedback):
         untraced = "the test wants the plain loop"
 
-    slow = played(engine, Plain(**{f.name: getattr(attack, f.name) for f in dataclasses.fields(attack)}), "chi2_kf" if "platoon" not in engine else "chi2_dkf")
-    assert [fast.trace_hash(i) for i in range(3)] == [slow.trace_hash(i) for i in range(3)]
+    slow = played(place, Plain(**{f.name: getattr(attack, f.name) for f in dataclasses.fields(attack)}), defence)
+    assert fast.target.any() and [fast.trace_hash(i) for i in range(3)] == [slow.trace_hash(i) for i in range(3)]
 
 
 @pytest.mark.parametrize(
@@ -76,7 +84,10 @@ def test_the_engine_plays_the_same(engine: str) -> None:
         ("feedback:weights.position=[1,0,0,0]", InputError, "weights.position: got .* at least 5 items"),
         ("feedback:kind=insider", InputError, "kind: got 'insider'"),
         ("feedback:kind=noise_jam", NotApplicable, "sensors without an echo"),
-        ("feedback:later=delay", InputError, "later: got 'delay'"),
+        ("feedback:later=delay,switch=2", InputError, "later: got 'delay'"),
+        ("feedback:later=dos_jam", InputError, "later, switch: got .*; expected both, or neither"),
+        ("feedback:switch=3", InputError, "later, switch: got .*; expected both, or neither"),
+        ("feedback:targets=[position],weights.velocity=[1,0,0,0,0]", InputError, "weights: got 'velocity'; expected a wire that is attacked"),
     ],
 )
 def test_wrong_words_are_named(text: str, error: type[Exception], words: str) -> None:
@@ -86,4 +97,4 @@ def test_wrong_words_are_named(text: str, error: type[Exception], words: str) ->
 
 def test_a_kind_that_is_not_granted_has_no_meaning() -> None:
     with pytest.raises(NotApplicable, match="a threat model that grants dos_jam"):
-        Spec("attack", "feedback:later=dos_jam").make().prepare(load_scenario("gusty-stop-and-go-v0").with_threat(kinds=["fdi"]).brief())
+        Spec("attack", "feedback:later=dos_jam,switch=2").make().prepare(load_scenario("gusty-stop-and-go-v0").with_threat(kinds=["fdi"]).brief())

@@ -135,7 +135,7 @@ def test_an_entry_s_page_has_all_parts(site):
     assert "leaderboard check OUT/synthetic-v0/board.json --defence chi2_kf:eta=15" in text and "leaderboard check FILE" in site.read_text(encoding="utf-8")
     bare = entry(site, HOSTILE).read_text(encoding="utf-8")
     assert "came without a card" in bare and "No replay. The board holds no worst episode" in bare and "Stealth and impact" not in bare
-    assert "no board imports a class that was handed in" in bare and "leaderboard check" not in bare  # a board does not import it
+    assert "no board imports a class from outside the package" in bare and "leaderboard check" not in bare  # a board does not import it
     assert [_imported(text) for text in ("chi2_kf:eta=3", "composed:detector=mine:D", "bwrap/mine:D", HOSTILE)] == [False, True, True, True]
 
 

@@ -1,7 +1,9 @@
 """The parts of playing a submission: data that cannot be written, seeds, copies, orders, sandboxes, and nobody left behind."""
 
 import argparse
+import fcntl
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -23,6 +25,7 @@ from tailgate.evaluation.rounds import seeds_of
 from tailgate.play.trace import rollout
 from tailgate.sandbox import Isolated, Limits, digest_of, mixed
 from tailgate.sandbox.limits import Lost
+from tailgate.sandbox.process import _readable
 from tailgate.sandbox.sandbox import Sandbox, bwrap, docker, sandbox_of
 from tailgate.sandbox.source import staged
 from tailgate.sandbox.table import order_of
@@ -201,3 +204,21 @@ def test_a_wrong_parameter_is_told_and_a_prior_may_be_a_view() -> None:
         plan = guard.prepare(load_scenario("stop-and-go-v0").brief().model)
         state = guard.start(plan, Prior(np.zeros((2, 1, 3)), np.broadcast_to(np.eye(3), (2, 1, 3, 3))))
         assert state.row.tolist() == [0, 1]
+
+
+def test_a_process_is_heard_at_a_file_of_a_high_number() -> None:
+    """`select` refuses file 1024 and above, and a wait of weeks is more than 32 bits of milliseconds."""
+    held = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if held[1] != resource.RLIM_INFINITY and held[1] < 2000:
+        pytest.skip("no file may have such a number")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(held[0], 2000), held[1]))
+    read, write = os.pipe()
+    high = fcntl.fcntl(read, fcntl.F_DUPFD, 1500)
+    try:
+        assert _readable([high], 0.0) == []
+        os.write(write, b"x")
+        assert _readable([high], 1e9) == [high]
+    finally:
+        for fd in (read, write, high):
+            os.close(fd)
+        resource.setrlimit(resource.RLIMIT_NOFILE, held)

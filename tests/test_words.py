@@ -108,7 +108,7 @@ def test_prose_of_pages_is_plain() -> None:
 def _shown(page: str) -> list[str]:
     """Return the sentences that a template of a page shows; headings and values are no prose."""
     page = re.sub(r"(?s)\{#.*?#\}|<!--.*?-->|<(script|style|summary|nav|h\d)\b.*?</\1>", "\n\n", page)
-    page = re.sub(r"(?s)\{%-?\s*(?:el(?:if|se)|if|for|end(?:if|for))\b.*?%\}", "\n\n", page)  # between alternatives a sentence ends
+    page = re.sub(r"(?s)\{%-?\s*(?:el(?:if|se)|for|endfor)\b.*?%\}", "\n\n", page)  # between alternatives a sentence ends
     page = re.sub(r"(?s)\{\{.*?\}\}", "0", re.sub(r"(?s)\{%.*?%\}", "", page))
     page = re.sub(r"<(?!/?(?:a|b|em|i|code)\b)[^>]*>", "\n\n", page)
     return [" ".join(part.split()) for part in re.split(r"(?<=[.?!])\s+|\n\s*\n", re.sub(r"<[^>]*>", "", page)) if part.strip()]
@@ -120,7 +120,7 @@ def test_what_templates_show_is_found() -> None:
 
 
 def test_prose_of_templates_and_notebooks_is_plain() -> None:
-    texts = {path.name: _shown(path.read_text(encoding="utf-8")) for path in TEMPLATES}
+    texts = {str(path.relative_to(SOURCE)): _shown(path.read_text(encoding="utf-8")) for path in TEMPLATES}
     for path in (ROOT / "docs/tutorials").glob("*.ipynb"):
         cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
         texts[path.name] = [part for cell in cells if cell["cell_type"] == "markdown" for part in _prose("".join(cell["source"]))]

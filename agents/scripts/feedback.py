@@ -11,7 +11,7 @@ from tailgate.agents.scripts.aim import chosen, require
 from tailgate.agents.scripts.radio import on_receivers
 from tailgate.agents.scripts.scripted import Script, ScriptPlan
 from tailgate.base.errors import InputError
-from tailgate.core import Array, Command, Count, Finite, Kind, View, param
+from tailgate.core import Array, Command, Finite, Kind, PositiveCount, View, param
 from tailgate.core.draws import Draws
 from tailgate.core.kinds import AIRED, EFFECTS
 from tailgate.core.registry import register
@@ -46,7 +46,8 @@ def fed_back(weights: Array, seen: tuple[Array, ...]) -> Array:
 class Feedback(Script):
     """Each wire gets a value that follows the road, 0.1 sinh(w . (1, t, gap / 20 m, closing / 5 m/s, speed / 20 m/s)), cut at the bounds.
 
-    t [s] is the time since the window opened. Over the air the largest |value| counts. A kind without a value needs no weights.
+    t [s] is the time since the window opened. The argument of sinh is cut at 8, and a gap without a car ahead counts as 0. Over the air the
+    largest |value| counts. A kind without a value needs no weights.
     """
 
     kind: Form = param("fdi", "kind of the attack")
@@ -54,7 +55,11 @@ class Feedback(Script):
         None, f"five weights w for each wire that gets a value, by name; the others get 0. none: {USUAL} for every wire", if_any=True
     )
     later: Form | None = param(None, "kind after `switch` steps; none: the same")
-    switch: Count = param(0, "steps of the window before the later kind")
+    switch: PositiveCount | None = param(None, "steps of the window before the later kind", if_any=True)
+
+    def __post_init__(self) -> None:
+        if (self.later is None) != (self.switch is None):
+            raise InputError("attack feedback: later, switch", [self.later, self.switch], "both, or neither")
 
     def prepare(self, brief: Brief) -> ScriptPlan:
         where, wires = "attack feedback", brief.model.wires
@@ -66,12 +71,15 @@ class Feedback(Script):
         if {self.kind, self.later or self.kind} & {kind.name.lower() for kind in AIRED}:
             target = on_receivers(brief, where, target, bool(self.targets))
         require(brief, where, [self.kind, self.later or self.kind], target)
+        for name in self.weights or ():
+            if not target[:, wires.index(name)].any():
+                raise InputError(f"{where}.weights", name, "a wire that is attacked: see targets")
         return self.plan(brief, target, np.array([held.get(name, (0.0,) * FEATURES) for name in wires]))
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:
         brief, first = plan.brief, Kind[self.kind.upper()]
         raw = fed_back(plan.extra, road(view, count, brief.model.dt))
-        if self.later is None:
+        if self.later is None or self.switch is None:
             return brief.command(on, first, plan.target, _sent(brief, first, raw))
         then, second = count >= self.switch, Kind[self.later.upper()]
         value = np.where(then[:, None, None], _sent(brief, second, raw), _sent(brief, first, raw))

@@ -31,9 +31,10 @@ FACES: dict[str, dict[str, Any]] = {  # defaults of each id
     "tailgate/Highway-v0": {"scenario": "highway-v0", "defence": "chi2_kf"},
 }
 OTHERS = (  # arguments of environments that are no options of actions and rewards
-    "scenario", "defence", "threat", "knowledge", "frames", "engine", "render_mode", "viewer", "size", "max_episode_steps", "autoreset",
-    "autoreset_mode", "device", "threads",
+    "scenario", "defence", "threat", "knowledge", "frames", "engine", "render_mode", "viewer", "size", "max_episode_steps", "device",
+    "threads", "autoreset", "autoreset_mode",
 )  # fmt: skip
+AUTORESET = "autoreset", "autoreset_mode"  # the second is Gymnasium's word
 RETURN = {"gap_shaping", "error_shaping", "horizon_ends"}  # options that go with a reward that is given as an object, too
 _LEARN: dict[str, Any] = {"error_shaping": 0.0, "gap_shaping": 0.0}
 FACES |= {  # tasks that are worth learning: a budget, decisions that last, no shaping
@@ -59,6 +60,14 @@ FACES |= {  # tasks that are worth learning: a budget, decisions that last, no s
 for _name in ("CarFollowing", "RadarFollowing", "Platoon"):
     _face = {key: value for key, value in FACES[f"tailgate/{_name}-v1"].items() if key != "shares"}  # a vector has every size
     FACES[f"tailgate/{_name}Continuous-v1"] = _face | {"action": "continuous"}
+
+
+def without_autoreset(arguments: dict[str, Any], expected: str) -> dict[str, Any]:
+    """Return the arguments of an environment that resets in one way only; raise InputError if they name a mode."""
+    for name in AUTORESET:
+        if name in arguments:
+            raise InputError(name, arguments[name], expected)
+    return arguments
 
 
 class Tally(NamedTuple):

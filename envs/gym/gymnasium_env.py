@@ -20,7 +20,7 @@ from tailgate.base.errors import InputError, unknown
 from tailgate.core import Array, Frame, draws
 from tailgate.core.loop import LoopState
 from tailgate.envs.gym.actions import action_space
-from tailgate.envs.gym.attacker_mdp import FACES, Seat, Tally
+from tailgate.envs.gym.attacker_mdp import FACES, Seat, Tally, without_autoreset
 from tailgate.envs.gym.batches import PlainEpisodes, TracedEpisodes, framed, side_by_side
 from tailgate.envs.gym.observations import LIMIT
 from tailgate.envs.gym.shadow import Begun, Decided
@@ -36,7 +36,7 @@ _AUTORESET = {"next_step": AutoresetMode.NEXT_STEP, "same_step": AutoresetMode.S
 class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Array]):
     """B adversary environments stepped as one batch; arguments as `Seat.make`, viewer, size as `Viewer`, engine as `batches`.
 
-    autoreset: next_step, same_step or disabled; `autoreset_mode` is Gymnasium's word for it.
+    autoreset: next_step (the default), same_step or disabled. autoreset_mode: the same, by Gymnasium's word.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own annotation
@@ -45,15 +45,18 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
     purpose: ClassVar[str] = "train"
 
     def __init__(
-        self, num_envs: int = 1, *, render_mode: str | None = None, autoreset: str | AutoresetMode = "next_step", viewer: str = "auto",
+        self, num_envs: int = 1, *, render_mode: str | None = None, autoreset: str | AutoresetMode | None = None,
+        autoreset_mode: str | AutoresetMode | None = None, viewer: str = "auto",
         size: tuple[int, int] | None = None, engine: str = "auto", threads: int = 1, max_episode_steps: int | None = None,
         device: str | None = None, **arguments: Any,
     ) -> None:  # fmt: skip
         num_envs = sizes.check("num_envs", num_envs)
-        autoreset = arguments.pop("autoreset_mode", autoreset)
-        autoreset = autoreset.name.lower() if isinstance(autoreset, AutoresetMode) else autoreset
-        if autoreset not in _AUTORESET:
-            raise unknown("autoreset", autoreset, _AUTORESET)
+        if autoreset is not None and autoreset_mode is not None:
+            raise InputError("autoreset_mode", autoreset_mode, f"none, as autoreset is {autoreset}")
+        given = autoreset_mode if autoreset is None else autoreset
+        resets = "next_step" if given is None else given.name.lower() if isinstance(given, AutoresetMode) else str(given)
+        if resets not in _AUTORESET:
+            raise unknown("autoreset" if autoreset_mode is None else "autoreset_mode", given, _AUTORESET)
         limit = limit_of("max_episode_steps", max_episode_steps)
         if render_mode not in (None, "rgb_array"):
             why = "; a window shows one episode: gymnasium.make(..., render_mode='human')" if render_mode == "human" else ""
@@ -62,7 +65,7 @@ class AdversaryVectorEnv(Specified, gymnasium.vector.VectorEnv[Array, Array, Arr
         sizes.fits(num_envs * self.seat.memory, "num_envs", num_envs, f"{num_envs:,} environments")
         self.num_envs = num_envs
         self.render_mode, self.viewer = render_mode, Viewer(viewer, size)
-        self.autoreset_mode = _AUTORESET[autoreset]
+        self.autoreset_mode = _AUTORESET[resets]
         self.horizon = min(self.seat.decisions, limit or self.seat.decisions)  # decisions of an episode that nothing ends early
         self._limit = limit if limit <= self.seat.decisions else 0
         self._elapsed = np.zeros(num_envs, np.int64)  # decisions of the present episode, where there is a limit
@@ -267,9 +270,7 @@ class AdversaryEnv(Specified, gymnasium.Env[Array, Any]):
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's own annotation
 
     def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
-        for name in ("autoreset", "autoreset_mode"):
-            if name in arguments:
-                raise InputError(name, arguments[name], "a vector environment (make_vec); a single one is reset by its user")
+        without_autoreset(arguments, "a vector environment (make_vec); a single one is reset by its user")
         if arguments.get("device") not in (None, "cpu"):
             raise InputError("device", arguments["device"], "cpu, or a vector environment (make_vec)")
         arguments["device"] = "cpu"  # a card plays many episodes, not one

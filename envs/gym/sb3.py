@@ -13,7 +13,7 @@ except ImportError as error:
 
 from tailgate.base.errors import unknown
 from tailgate.core import Array
-from tailgate.envs.gym.attacker_mdp import CAR_FOLLOWING, FACES
+from tailgate.envs.gym.attacker_mdp import CAR_FOLLOWING, FACES, without_autoreset
 from tailgate.envs.gym.gymnasium_env import AdversaryEnv, AdversaryVectorEnv
 
 
@@ -27,6 +27,7 @@ class BatchVecEnv(VecEnv):
     def __init__(self, num_envs: int, id: str = CAR_FOLLOWING, **arguments: Any) -> None:
         if id not in FACES:
             raise unknown("id", id, FACES)
+        without_autoreset(arguments, "nothing: Stable-Baselines3 wants rows that are reset in the same step")
         self.batch = AdversaryVectorEnv(num_envs, autoreset="same_step", **(FACES[id] | arguments))
         super().__init__(num_envs, self.batch.single_observation_space, self.batch.single_action_space)
         self._actions: Array = np.zeros(0)

@@ -14,8 +14,7 @@ try:
 except ImportError as error:
     raise ImportError("TorchRL is missing: pip install 'tailgate[torchrl]'") from error
 
-from tailgate.base.errors import InputError
-from tailgate.envs.gym.attacker_mdp import CAR_FOLLOWING
+from tailgate.envs.gym.attacker_mdp import CAR_FOLLOWING, without_autoreset
 from tailgate.envs.torch.tensors import Tensor, TensorVecEnv
 
 
@@ -26,8 +25,7 @@ class TailgateEnv(EnvBase):  # type: ignore[misc]
     """
 
     def __init__(self, num_envs: int, id: str = CAR_FOLLOWING, *, device: str | None = None, **arguments: Any) -> None:
-        if "autoreset" in arguments:
-            raise InputError("autoreset", arguments["autoreset"], "nothing: TorchRL resets rows that are done")
+        without_autoreset(arguments, "nothing: TorchRL resets rows that are done")
         env = TensorVecEnv(num_envs, id, device=device, autoreset="disabled", **arguments)
         super().__init__(device=env.device, batch_size=torch.Size([num_envs]))
         self.env = env

@@ -6,6 +6,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from tailgate.base.errors import InputError
 from tailgate.core import Model, draws
 from tailgate.core.draws import Role
 from tailgate.core.kinds import KindName
@@ -120,6 +121,6 @@ def _fits(scenario: str, defence: str, attack: str, changes: tuple[tuple[str, An
         plan = made.prepare(loop.brief)
         state = loop.start(keys)
         loop.step(state, made, plan, made.start(plan, 1, keys.at(Role.ATTACK, np.zeros(1, np.int64))))
-    except (ValueError, TypeError):  # InputError is one
+    except InputError:
         return False
     return True

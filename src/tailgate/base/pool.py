@@ -26,6 +26,7 @@ from tailgate.base import own_modules, sizes
 from tailgate.base.errors import InputError, Killed
 
 R = TypeVar("R")
+UNGUARDED = 86  # exit status of a worker whose main module starts workers itself
 ENDING = 5.0  # [s] for an idle worker to end before it is killed
 THREADS = "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"  # of numpy; the first counts
 _SIGNALS = {signal.SIGINT, signal.SIGTERM}
@@ -74,9 +75,10 @@ class _Worker:
     """A process and the parent's end of its pipe."""
 
     def __init__(self) -> None:
+        if getattr(multiprocessing.current_process(), "_inheriting", False):  # a worker that is importing its main module
+            os._exit(UNGUARDED)
         self.pipe, theirs = multiprocessing.Pipe()
         self.job: int | None = None
-        self.begun = False  # if it has said that it takes jobs
         # a daemon, so that an idle worker does not delay the parent's exit
         self.process = multiprocessing.get_context("spawn").Process(
             target=_serve, args=(theirs, list(sys.path), bool(own_modules.folders())), daemon=True
@@ -90,12 +92,12 @@ class _Worker:
             theirs.close()
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    def check_begun(self) -> None:
-        """Raise InputError if the process, which is gone, failed before it could take a job."""
+    def check_guarded(self) -> None:
+        """Raise InputError if the process, which is gone, came to a main module that starts workers itself."""
         self.process.join(ENDING)
-        if not self.begun and (self.process.exitcode or 0) > 0:
-            wanted = 'a script that starts its work below `if __name__ == "__main__":`; the error of the worker is printed above'
-            raise InputError("workers", f"a worker that failed at its start, with status {self.process.exitcode}", wanted) from None
+        if self.process.exitcode == UNGUARDED:
+            wanted = 'a script that starts its work below `if __name__ == "__main__":`, since each worker imports it'
+            raise InputError("workers", "a script whose main module starts workers itself", wanted) from None
 
     def end(self, seconds: float) -> None:
         """Close the pipe, which ends an idle worker; kill a worker that still runs after `seconds`."""
@@ -163,19 +165,7 @@ class Crew:
             idle.pipe.send((function, arguments))
 
     def wait(self) -> list[Answer]:
-        """Wait until at least one message arrives; return all that have arrived.
-
-        Raises
-        ------
-        InputError
-            A worker cannot begin, such as by the main module of a script that starts workers itself.
-        """
-        found: list[Answer] = []
-        while not found:
-            found = self._arrived()
-        return found
-
-    def _arrived(self) -> list[Answer]:
+        """Wait until at least one message arrives; return all that have arrived."""
         found = []
         held = {worker.pipe: worker for worker in self.busy}
         for pipe in connection.wait(list(held)):
@@ -186,12 +176,9 @@ class Crew:
                 word, value = worker.pipe.recv()
             except (EOFError, ConnectionError):
                 self.workers.remove(worker)
-                worker.check_begun()
+                worker.check_guarded()
                 worker.end(0.0)
                 found.append(Answer(job, "died"))
-                continue
-            if word == "begun":
-                worker.begun = True
                 continue
             if word != "said":
                 worker.job = None
@@ -285,7 +272,6 @@ def _serve(pipe: connection.Connection, path: list[str], own: bool) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _line = pipe
     with contextlib.suppress(EOFError, ConnectionError):
-        pipe.send(("begun", None))
         while True:
             _answer(pipe)
 

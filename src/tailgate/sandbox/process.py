@@ -243,7 +243,7 @@ def _readable(files: Sequence[int], seconds: float) -> list[int]:
     poll = select.poll()  # `select.select` knows no file above number 1023
     for fd in files:
         poll.register(fd, select.POLLIN)
-    return [fd for fd, _ in poll.poll(1000.0 * seconds)]
+    return [fd for fd, _ in poll.poll(1000.0 * min(seconds, 1e6))]  # [ms] in 32 bits; who waits longer asks again
 
 
 def _environment(home: str, root: str) -> dict[str, str]:
