@@ -10,7 +10,7 @@ from tailgate import num
 from tailgate.agents.scripts.aim import chosen, require
 from tailgate.agents.scripts.radio import on_receivers
 from tailgate.agents.scripts.scripted import Script, ScriptPlan
-from tailgate.base.errors import InputError
+from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import Array, Command, Finite, Kind, PositiveCount, View, param
 from tailgate.core.draws import Draws
 from tailgate.core.kinds import AIRED, EFFECTS
@@ -19,7 +19,6 @@ from tailgate.core.threat import Brief, fit
 
 FEATURES = 5  # of `road`
 UNIT, STEEPEST = 0.1, 8.0  # of a value near 0 [unit of the wire], and the largest argument of sinh: a value of 149
-USUAL = (-3.0, 0.0, 0.0, 0.0, 0.0)  # a value of about -1
 Form = Literal["fdi", "dos_jam", "dos_hold", "dos_hold_fresh", "dropout", "noise_jam", "echo_delay"]
 Weights = Annotated[tuple[Finite, ...], Field(min_length=FEATURES, max_length=FEATURES)]
 
@@ -52,7 +51,7 @@ class Feedback(Script):
 
     kind: Form = param("fdi", "kind of the attack")
     weights: dict[str, Weights] | None = param(
-        None, f"five weights w for each wire that gets a value, by name; the others get 0. none: {USUAL} for every wire", if_any=True
+        None, "five weights w for each wire that gets a value, by name; the others get 0. A kind with a value needs them", if_any=True
     )
     later: Form | None = param(None, "kind after `switch` steps; none: the same")
     switch: PositiveCount | None = param(None, "steps of the window before the later kind", if_any=True)
@@ -63,7 +62,9 @@ class Feedback(Script):
 
     def prepare(self, brief: Brief) -> ScriptPlan:
         where, wires = "attack feedback", brief.model.wires
-        held = dict.fromkeys(wires, USUAL) if self.weights is None else self.weights
+        held = self.weights or {}
+        if not held and any(EFFECTS[Kind[kind.upper()]].valued for kind in (self.kind, self.later or self.kind)):
+            raise NotApplicable(f"{where}.weights", None, f"five weights for a wire, such as weights.{wires[0]}=[-3,0,0,0,0]")
         for name in held:
             if name not in wires:
                 raise InputError(f"{where}.weights", name, f"wires ({', '.join(wires)})")
@@ -71,7 +72,7 @@ class Feedback(Script):
         if {self.kind, self.later or self.kind} & {kind.name.lower() for kind in AIRED}:
             target = on_receivers(brief, where, target, bool(self.targets))
         require(brief, where, [self.kind, self.later or self.kind], target)
-        for name in self.weights or ():
+        for name in held:
             if not target[:, wires.index(name)].any():
                 raise InputError(f"{where}.weights", name, "a wire that is attacked: see targets")
         return self.plan(brief, target, np.array([held.get(name, (0.0,) * FEATURES) for name in wires]))
