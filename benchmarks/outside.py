@@ -57,7 +57,7 @@ class Numbers(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What B attacks remember."""
+    """The attacks of B episodes and their state; every leaf has B first."""
 
     numbers: Numbers
     opened: Array  # (B,) bool
@@ -95,7 +95,7 @@ class Many:
 
 
 class Choice(NamedTuple):
-    """What does not vary within a search by CMA-ES."""
+    """The choices that CMA-ES leaves as they are."""
 
     kind: int
     later: int

@@ -258,7 +258,7 @@ def test_bad_input_is_named_before_anything_is_played(tmp_path, capsys, words, e
 
 
 def test_the_result_of_another_job_is_set_aside(tmp_path, capsys):
-    """Its counterexample would stand beside the new report."""
+    """Otherwise an old counterexample would lie next to the new report."""
     words = ["falsify", "kf", "--scenario", "braking-v0", "--attack", "none", "--trials", "8", "--out", str(tmp_path / "found"), "--property"]
     assert main([*words, "G[0,60] gap > 200"]) == 0 and (tmp_path / "found" / "counterexample.json").is_file()
     shutil.rmtree(tmp_path / "found" / "generations")

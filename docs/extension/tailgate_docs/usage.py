@@ -1,4 +1,7 @@
-"""How a component is used: a command or a few lines that work, with the first scenario where the component has a meaning."""
+"""Examples on the pages of components.
+
+An example is a command or a few lines of Python. It uses the first scenario in which the component has a meaning.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
