@@ -81,13 +81,13 @@ class Feedback(Script):
         brief, first = plan.brief, Kind[self.kind.upper()]
         raw = fed_back(plan.extra, road(view, count, brief.model.dt))
         if self.later is None or self.switch is None:
-            return brief.command(on, first, plan.target, _sent(brief, first, raw))
+            return brief.command(on, first, plan.target, sent(brief, first, raw))
         then, second = count >= self.switch, Kind[self.later.upper()]
-        value = np.where(then[:, None, None], _sent(brief, second, raw), _sent(brief, first, raw))
+        value = np.where(then[:, None, None], sent(brief, second, raw), sent(brief, first, raw))
         return brief.command(on, np.where(then, second, first), plan.target, value)
 
 
-def _sent(brief: Brief, kind: Kind, raw: Array) -> Array:
+def sent(brief: Brief, kind: Kind, raw: Array) -> Array:
     """Return the values (B, N, w) that a kind sends; none of a kind without a value."""
     if not EFFECTS[kind].valued:
         return np.zeros(raw.shape)

@@ -56,6 +56,34 @@ class Decider(Protocol):
         """Return the next memory and the commands."""
 
 
+class Opening(Protocol):
+    """The numbers of B triggers."""
+
+    @property
+    def trigger(self) -> Array:
+        """(B,) int64: place in TRIGGERS."""
+
+    @property
+    def threshold(self) -> Array:
+        """(B,) of the trigger."""
+
+    @property
+    def start(self) -> Array:
+        """(B,) int64: first step."""
+
+
+def opens(plan: Brief, view: View, rows: Opening, lead_speed: Array) -> Array:
+    """Return (B,) bool: triggers fire in this step. lead_speed: (B, N) at the last look."""
+    scene, level, trigger = view.scene, rows.threshold[:, None], rows.trigger[:, None]
+    holds = np.where(trigger == NEAR, scene.gap < level, trigger == 0)
+    holds = np.where(trigger == FAST, scene.speed > level, holds)
+    holds = np.where(trigger == SLOW, scene.speed < level, holds)
+    holds = np.where(trigger == CLOSING, scene.speed - scene.lead_speed > level, holds)
+    holds = np.where(trigger == BRAKING, (lead_speed - scene.lead_speed) / plan.model.dt > level, holds)
+    ready = (view.k >= rows.start) & (view.k >= plan.threat.onset)
+    return np.asarray(ready & holds.any(axis=1))
+
+
 @dataclass(frozen=True)
 class Scripts:
     """An attack that plays another script, or another program of two phases, in each row."""
@@ -64,19 +92,12 @@ class Scripts:
 
     def decide(self, plan: Brief, memory: Memory, view: View, draws: Draws) -> tuple[Memory, Command]:
         """Return the next memory and the commands: what `tailgate.agents.scripts` sends under the same numbers."""
-        count, opened = memory.elapsed, memory.opened
+        count = memory.elapsed
         rows = memory.scripts.phases[0]
         if self.programs:
             second = memory.phase == 1
             rows = Rows(*(np.where(widened(second, new), new, old) for old, new in zip(*memory.scripts.phases, strict=True)))
-        scene, level, trigger = view.scene, rows.threshold[:, None], rows.trigger[:, None]
-        holds = np.where(trigger == NEAR, scene.gap < level, trigger == 0)
-        holds = np.where(trigger == FAST, scene.speed > level, holds)
-        holds = np.where(trigger == SLOW, scene.speed < level, holds)
-        holds = np.where(trigger == CLOSING, scene.speed - scene.lead_speed > level, holds)
-        holds = np.where(trigger == BRAKING, (memory.lead_speed - scene.lead_speed) / plan.model.dt > level, holds)
-        ready = (view.k >= rows.start) & (view.k >= plan.threat.onset)
-        opened = opened | (ready & holds.any(axis=1))
+        opened = memory.opened | opens(plan, view, rows, memory.lead_speed)
         on = opened & view.allowed & (count % (rows.burst + rows.pause) < rows.burst)
         if view.probed is not None:
             on = on & (view.probed.any(axis=1) | ~rows.hop)
@@ -96,7 +117,7 @@ class Scripts:
             over = (attacked >= memory.scripts.length) & (phase == 0)
             phase, opened = phase + over, opened & ~over
             attacked, elapsed = np.where(over, 0, attacked), np.where(over, 0, elapsed)
-        return Memory(memory.scripts, phase, attacked, opened, elapsed, np.array(scene.lead_speed)), command
+        return Memory(memory.scripts, phase, attacked, opened, elapsed, np.array(view.scene.lead_speed)), command
 
 
 def remembered(scripts: Sequence, agents: int) -> Memory:

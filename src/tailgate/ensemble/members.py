@@ -32,6 +32,7 @@ class Budget:
 
     scripts: Effort
     programs: Effort
+    feedback: Effort
     population: int  # of a generation of policies
     phases: tuple[tuple[int, int], ...]  # of the race of policies: generations, and episodes of each member
     pace: Pace  # of the gradient attack
@@ -45,12 +46,12 @@ class Budget:
         """Return the episodes that all members play in a scenario, about; those that do not learn unless `whole`."""
         race = self.race if traced else self.race.shorter()
         races = race.episodes(STARTS, agents) + race.episodes(GREY + PUBLISHED, agents)
-        return self.scripts.episodes(agents) + self.programs.episodes(agents) + (races if whole else 0)
+        return self.scripts.episodes(agents) + self.programs.episodes(agents) + self.feedback.episodes(agents) + (races if whole else 0)
 
 
 BUDGETS = {
-    "quick": Budget(Effort(512, 5), Effort(256, 4), 32, ((16, 16), (12, 32), (24, 64)), Pace(256, 1, 8, 64)),
-    "standard": Budget(Effort(2048, 12), Effort(1024, 10), 64, ((40, 32), (40, 64), (60, 128)), Pace(2048, 2, 20, 128)),
+    "quick": Budget(Effort(512, 5), Effort(256, 4), Effort(512, 12), 32, ((16, 16), (12, 32), (24, 64)), Pace(256, 1, 8, 64)),
+    "standard": Budget(Effort(2048, 12), Effort(1024, 10), Effort(1024, 40), 64, ((40, 32), (40, 64), (60, 128)), Pace(2048, 2, 20, 128)),
 }
 
 
@@ -96,6 +97,13 @@ def _programs(hunt: Hunt) -> list[str]:
     first = space.around(arena.space, hunt.genomes, rng) if hunt.genomes is not None and space.families else None
     found = search(arena, space, hunt.budget.programs, hunt.seed, first=first, tell=hunt.tell)
     return [space.text(genome, hunt.folder) for genome in found[:FINALISTS]]
+
+
+def _feedback(hunt: Hunt) -> list[str]:
+    """Search values that follow the road, of every kind."""
+    space = hunt.arena.feedbacks
+    found = search(hunt.arena, space, hunt.budget.feedback, hunt.seed, tell=hunt.tell)
+    return list(dict.fromkeys(space.text(genome) for genome in found))[:FINALISTS]
 
 
 def _policies(hunt: Hunt, knowledge: str) -> list[str]:
@@ -149,6 +157,7 @@ class Member(NamedTuple):
 MEMBERS = (
     Member("scripts", "black", _scripts, 7),
     Member("programs", "black", _programs, 7),
+    Member("feedback", "black", _feedback, 10),
     Member("transfer", "black", _transfer, 1),
     Member("networks", "black", lambda hunt: _policies(hunt, "black"), 48, learns=True),
     Member("grey networks", "grey", lambda hunt: _policies(hunt, "grey"), 30, learns=True),

@@ -22,7 +22,8 @@ from tailgate.core.loop import Loop
 from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
 from tailgate.engine.agreement import ROWS, Untraced
-from tailgate.ensemble.battery import Episodes, Played, Scripts, battery_of, played_plainly, remembered
+from tailgate.ensemble.battery import Decider, Episodes, Played, Scripts, battery_of, played_plainly, remembered
+from tailgate.ensemble.feedbacks import Feedbacks, Many, Numbers
 from tailgate.ensemble.programs import Programs
 from tailgate.ensemble.space import Sequence, Space, road_of
 from tailgate.evaluation.cells import Cell
@@ -130,6 +131,11 @@ class Arena:
         return Programs(Space(self.space.brief, self.space.road, phase=True))
 
     @cached_property
+    def feedbacks(self) -> Feedbacks:
+        """The values that follow the road that are granted here."""
+        return Feedbacks(self.space)
+
+    @cached_property
     def start(self) -> float:
         """The mean smallest gap at the start of an episode [m]; infinite where nobody drives."""
         scene = self.loop.plant.scene(self.loop.plan.plant, self.loop.start(draws.keys("tune", range(FIRST))).plant)
@@ -179,18 +185,18 @@ class Arena:
         lost = 1.0 - played.moved / np.maximum(reach, 1e-9)
         return played.moved < self.progress * reach, np.clip(lost / (1.0 - self.progress), 0.0, 1.0)
 
-    def scores(self, scripts: Sequence, first: int, episodes: int) -> Array:
+    def scores(self, scripts: Sequence | Numbers, first: int, episodes: int) -> Array:
         """Return the sum of scores (scripts,) of each script over the same episodes, from number `first` on."""
-        loop, agents, total = self.loop, self.loop.model.agents, len(scripts.length)
+        loop, agents, total = self.loop, self.loop.model.agents, len(scripts[-1])
         keys = draws.keys("tune", range(first, first + episodes))
         each, reach = max(AT_ONCE // (agents * episodes), 1), self.reach("tune", first, episodes)
-        attack = Scripts(len(scripts.phases) > 1)
-        battery = battery_of(loop, attack, loop.brief, remembered(scripts.take(np.arange(ROWS) % total), agents))
+        attack, few = _at_start(scripts.take(np.arange(ROWS) % total), agents)
+        battery = battery_of(loop, attack, loop.brief, few)
         out = []
         for begin in range(0, total, each):
             some = np.arange(begin, min(begin + each, total))
             many = Keys(np.tile(keys.key, (len(some), 1)), np.tile(keys[1], len(some)))
-            memory = remembered(scripts.take(np.repeat(some, episodes)), agents)
+            _, memory = _at_start(scripts.take(np.repeat(some, episodes)), agents)
             if isinstance(battery, Untraced):
                 played = played_plainly(loop, attack, loop.brief, many, memory)
             else:
@@ -258,6 +264,13 @@ class Arena:
         return sorted(found, key=lambda one: -one.score)
 
 
+def _at_start(scripts: Sequence | Numbers, agents: int) -> tuple[Decider, object]:
+    """Return the attack that plays scripts, and its memory at the start of their episodes."""
+    if isinstance(scripts, Numbers):
+        return Many(), scripts.remembered()
+    return Scripts(len(scripts.phases) > 1), remembered(scripts, agents)
+
+
 def _whole(loop: Loop, attack: Attack, keys: Keys) -> Played | None:
     """Return the outcome of whole episodes in one program; None where the engine does not trace the attack, or a demand is broken."""
     plan = attack.prepare(loop.brief)
@@ -323,7 +336,8 @@ def _children(pool: Pool, count: int, leads: list[int], rng: np.random.Generator
 
 
 def search(
-    arena: Arena, space: Space | Programs, effort: Effort, seed: int = 0, *, first: Array | None = None, tell: Tell | None = None
+    arena: Arena, space: Space | Programs | Feedbacks, effort: Effort, seed: int = 0, *, first: Array | None = None,
+    tell: Tell | None = None,
 ) -> Array:  # fmt: skip
     """Search the attacks of a space that do most harm.
 
@@ -332,7 +346,7 @@ def search(
     arena
         The defence, and where it is attacked.
     space
-        Scripts or programs.
+        Scripts, programs or feedbacks.
     seed
         The same seed finds the same attacks.
     first

@@ -111,12 +111,12 @@ def _short(values: Array) -> Array:
     return np.array([float(f"{value:.4g}") for value in values.tolist()])
 
 
-def _pick(gene: Array, count: int) -> Array:
+def pick(gene: Array, count: int) -> Array:
     """Return for each gene a place among `count`."""
     return np.minimum((gene * count).astype(np.int64), count - 1)
 
 
-def _log(gene: Array, low: float, high: float) -> Array:
+def log_between(gene: Array, low: float, high: float) -> Array:
     """Return numbers between low and high, log-uniform for a uniform gene."""
     return np.asarray(low * (high / low) ** gene)
 
@@ -179,20 +179,20 @@ class Space:
         """Return the numbers of the scripts of genomes (B, genes)."""
         gene = dict(zip(GENES, np.moveaxis(genomes, 1, 0), strict=True))
         count, brief = len(genomes), self.brief
-        family, wires, agent = (_pick(gene[name], len(of)) for name, of in
+        family, wires, agent = (pick(gene[name], len(of)) for name, of in
                                 (("family", self.families), ("targets", self.wires), ("agent", self.agents)))  # fmt: skip
         base, rate = np.zeros(count), np.zeros(count)
         target = np.zeros((count, *brief.granted.shape), bool)
         for i, one in enumerate(self.families):
             here = family == i
             low, high = self.reach(one.kind)
-            size = _log(gene["size"][here], low, high)
+            size = log_between(gene["size"][here], low, high)
             signed = one.kind in (Kind.FDI, Kind.DOS_JAM)
             value = np.where(gene["sign"][here] < 0.5, -size, size) if signed else size
             base[here] = np.round(value) if one.whole else _short(value)
             if one.ramp:
                 fastest = max(2.0 * high / max(self.budget, 1), low)
-                growth = _log(gene["rate"][here], min(SMALL * high, 0.5 * fastest), fastest)
+                growth = log_between(gene["rate"][here], min(SMALL * high, 0.5 * fastest), fastest)
                 rate[here] = _short(np.where(gene["rate_sign"][here] < 0.5, -growth, growth) if signed else growth)
             target[here] = self._aired if one.air else brief.granted
         free = ~np.array([f.air for f in self.families])[family] | (not self.phase)  # a phase over the air hits all that a receiver reads
@@ -202,25 +202,29 @@ class Space:
         for i, number in enumerate(self.agents):
             if number is not None:
                 target[agent == i] &= (np.arange(brief.granted.shape[0]) == number)[:, None]
-        trigger = np.array([TRIGGERS.index(name) for name in self.triggers])[_pick(gene["trigger"], len(self.triggers))]
-        threshold = np.zeros(count)
-        for name, (low, high) in self.road.items():
-            here = trigger == TRIGGERS.index(name)
-            threshold[here] = _short(low + (high - low) * gene["when"][here])
-        threat = brief.threat
-        last = brief.horizon if threat.end is None else min(threat.end, brief.horizon)
-        first = threat.onset + _pick(gene["when"], max(last - threat.onset + 1, 1))
+        trigger, threshold, start = self.opening(gene["trigger"], gene["when"])
         many = (gene["bursts"] < 0.4) & (self.budget > 1) & (not self.phase)
         kinds, thens = (np.array([int(held) for held in each]) for each in
                         ((f.kind for f in self.families), (f.then or f.kind for f in self.families)))  # fmt: skip
         return Rows(
             kinds[family], thens[family],
-            np.where(kinds[family] == thens[family], NEVER, 1 + _pick(gene["switch"], max(self.budget, 1))), target, base, rate,
-            trigger, threshold, np.where(trigger == 0, first, 1),
-            np.where(many, np.round(_log(gene["burst"], 1.0, max(self.budget / 2, 1.0))).astype(np.int64), NEVER),
-            np.where(many, np.round(_log(gene["pause"], 1.0, LONG)).astype(np.int64), 0),
+            np.where(kinds[family] == thens[family], NEVER, 1 + pick(gene["switch"], max(self.budget, 1))), target, base, rate,
+            trigger, threshold, start,
+            np.where(many, np.round(log_between(gene["burst"], 1.0, max(self.budget / 2, 1.0))).astype(np.int64), NEVER),
+            np.where(many, np.round(log_between(gene["pause"], 1.0, LONG)).astype(np.int64), 0),
             (gene["hop"] < 0.3) & np.array([f.air for f in self.families])[family] & (not self.phase),
         )  # fmt: skip
+
+    def opening(self, trigger_gene: Array, when_gene: Array) -> tuple[Array, Array, Array]:
+        """Return trigger, threshold and first step (B,) each, of two genes (B,)."""
+        trigger = np.array([TRIGGERS.index(name) for name in self.triggers])[pick(trigger_gene, len(self.triggers))]
+        threshold, threat = np.zeros(len(trigger)), self.brief.threat
+        for name, (low, high) in self.road.items():
+            here = trigger == TRIGGERS.index(name)
+            threshold[here] = _short(low + (high - low) * when_gene[here])
+        last = self.brief.horizon if threat.end is None else min(threat.end, self.brief.horizon)
+        first = threat.onset + pick(when_gene, max(last - threat.onset + 1, 1))
+        return trigger, threshold, np.where(trigger == 0, first, 1)
 
     @property
     def _aired(self) -> Array:
@@ -238,12 +242,12 @@ class Space:
 
     def family(self, genome: Array) -> Family:
         """Return the family of one script."""
-        return self.families[int(_pick(genome[:1], len(self.families))[0])]
+        return self.families[int(pick(genome[:1], len(self.families))[0])]
 
     def sets(self, genome: Array) -> tuple[tuple[str, ...], int | None]:
         """Return the wires that one script names, and its agent; empty and None: all that are granted."""
         gene = dict(zip(GENES, genome[:, None], strict=True))
-        return self.wires[int(_pick(gene["targets"], len(self.wires))[0])], self.agents[int(_pick(gene["agent"], len(self.agents))[0])]
+        return self.wires[int(pick(gene["targets"], len(self.wires))[0])], self.agents[int(pick(gene["agent"], len(self.agents))[0])]
 
     def text(self, genome: Array, folder: Path | None = None) -> str:
         """Return the text of one script, as on the command line."""
