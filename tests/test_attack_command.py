@@ -37,16 +37,16 @@ def only(monkeypatch, *names):
         monkeypatch.setattr(module, "MEMBERS", [one for one in members.MEMBERS if one.name in names])
 
 
-@pytest.mark.parametrize("left_out", [("transfer", "grey networks", "white box"), pytest.param((), marks=pytest.mark.long)])
+@pytest.mark.parametrize("left_out", [("feedback", "transfer", "grey networks", "white box"), pytest.param((), marks=pytest.mark.long)])
 def test_the_command(left_out, small_ensemble, tmp_path, capsys, monkeypatch):
     """It compares with the suite's attacks, writes scripts that `evaluate` plays, and goes on where it was ended."""
-    kinds = {"scripts": "black", "programs": "black", "transfer": "black", "networks": "black", "grey networks": "grey", "white box": "white", "gradient": "white"}
+    kinds = {"scripts": "black", "programs": "black", "feedback": "black", "transfer": "black", "networks": "black", "grey networks": "grey", "white box": "white", "gradient": "white"}
     kinds = {name: kind for name, kind in kinds.items() if name not in left_out}
     only(monkeypatch, *kinds)
     assert main([*WORDS, "--out", str(tmp_path), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     (cell,) = report["cells"]
-    assert report["ensemble"] == "standard-v1" and cell["listed"]["attack"] in load_suite("radar-v0").attacks
+    assert report["ensemble"] == standard.NAME and cell["listed"]["attack"] in load_suite("radar-v0").attacks
     assert cell["found"]["episodes"] == 20 and cell["found"]["low"] <= cell["found"]["damage"] <= cell["found"]["high"]
     assert json.loads((tmp_path / "attack.json").read_text()) == report
     attacks = (tmp_path / "attacks.txt").read_text().splitlines()
@@ -223,7 +223,7 @@ def test_a_threat_model_that_grants_nothing(small_ensemble, capsys, tmp_path):
     assert main(words) == 0
     (cell,) = json.loads(capsys.readouterr().out)["cells"]
     own = {one["member"]: one for one in cell["members"]}
-    assert all(own[name]["attack"] is None and own[name]["why"] for name in ("scripts", "programs", "networks", "gradient"))
+    assert all(own[name]["attack"] is None and own[name]["why"] for name in ("scripts", "programs", "feedback", "networks", "gradient"))
 
 
 @pytest.mark.parametrize("name", ["a,b", "c[1]", "d:e"])

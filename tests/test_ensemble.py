@@ -17,10 +17,11 @@ from tailgate.core.scenario import load_suite
 from tailgate.engine.agreement import Untraced
 from tailgate.ensemble import evolution, members, networks, standard
 from tailgate.ensemble import search as searching
-from tailgate.ensemble.battery import Played, Scripts, battery_of, played_plainly, remembered
+from tailgate.ensemble.battery import Played, battery_of, played_plainly
+from tailgate.ensemble.climb import Climb, Stage, climbed
 from tailgate.ensemble.evolution import Evolution
 from tailgate.ensemble.networks import Race, _without_copies, learned, ramp_of, starts_of
-from tailgate.ensemble.search import Arena, Effort, search
+from tailgate.ensemble.search import Arena, Effort, at_start, search
 from tailgate.ensemble.space import FAMILIES, GENES, NEVER
 from tailgate.play.metrics import METRICS
 from tailgate.play.trace import rollout
@@ -42,13 +43,13 @@ def arena(name, **changes):
 
 def played(place, scripts, plainly=False):
     """Play scripts on the same episodes."""
-    count, loop, attack = len(scripts.length), place.loop, Scripts(len(scripts.phases) > 1)
+    count, loop = len(scripts[-1]), place.loop
     keys = draws.keys("tune", range(EPISODES))
     many = Keys(np.tile(keys.key, (count, 1)), np.tile(keys[1], count))
-    memory = remembered(scripts.take(np.repeat(np.arange(count), EPISODES)), loop.model.agents)
+    attack, memory = at_start(scripts.take(np.repeat(np.arange(count), EPISODES)), loop.model.agents)
     if plainly:
         return played_plainly(loop, attack, loop.brief, many, memory)
-    made = battery_of(loop, attack, loop.brief, remembered(scripts.take(np.arange(64) % count), loop.model.agents))
+    made = battery_of(loop, attack, loop.brief, at_start(scripts.take(np.arange(64) % count), loop.model.agents)[1])
     assert not isinstance(made, Untraced), made
     return made.play(many, memory)
 
@@ -111,6 +112,44 @@ def test_a_row_plays_what_the_file_of_its_program_says(name, tmp_path):
         assert_same(place, Played(*(part[i * EPISODES : (i + 1) * EPISODES] for part in outcome)), wanted, space.label(genome))
         attacked += on
     assert attacked > count / 4
+
+
+@pytest.mark.thin(2)
+@pytest.mark.parametrize("name", ["car", "radar", "platoon"])
+def test_a_row_plays_what_the_text_of_its_feedback_says(name):
+    """With every kind, trigger and set of wires."""
+    place, rng, attacked = arena(name), np.random.default_rng(9), 0
+    points = [place.feedbacks.drawn(rng) for _ in range(16)]
+    outcome = played(place, place.feedbacks.numbers(points))
+    for i, text in enumerate(map(place.feedbacks.text, points)):
+        wanted, on = as_evaluated(place, text)
+        assert_same(place, Played(*(part[i * EPISODES : (i + 1) * EPISODES] for part in outcome)), wanted, text)
+        attacked += on
+    assert attacked > 4 and {point.choice.kind for point in points} == set(place.feedbacks.kinds)
+
+
+def test_single_steps_with_every_pause_begin_the_search_of_scripts():
+    """Of every family, of both signs where it has a value; one pause alone defeats a defence that trusts again after 20 steps."""
+    suite = load_suite("quick-v1")
+    place = Arena(suite.name, "gusty-stop-and-go-v0", 12, "safe_state_brake", dict(suite.granted), suite.bound, suite.progress)
+    texts = [place.space.text(genome) for genome in place.space.rhythms]
+    assert len(set(texts)) == len(texts) == 30 * sum(1 + (bool(one.value) or one.ramp) for one in place.space.families)
+    assert {f"fdi:value={value},start_step=50,burst=1,pause={pause}" for value in (-50, 50) for pause in (1, 20, 30)} <= set(texts)
+    scores = place.scores(place.space.scripts(place.space.rhythms), 0, 16)
+    harmful = {text for text, score in zip(texts, scores, strict=True) if score > 0.2 * 16}
+    assert harmful == {f"{name},start_step=50,burst=1,pause=20" for name in ("fdi:value=50", "fdi_then_jam:value=50,inject=1")}
+    assert len(dataclasses.replace(place, dose=1).space.rhythms) == 0
+
+
+def test_a_climb_finds_more_than_the_random_attacks_that_it_begins_with():
+    """The same attacks each time, the most harmful first; where nobody drives, none."""
+    suite, effort = load_suite("radar-v1"), Climb(256, (Stage(4, 6),))
+    place = Arena(suite.name, "radar-braking-v0", 4, "cusum_kf", dict(suite.granted), suite.bound, suite.progress)
+    told = []
+    found = climbed(place, effort, 0, lambda *one: told.append(one))
+    assert found == climbed(place, effort) != climbed(place, effort, 1)
+    assert [one[:2] for one in told] == [(i, 6) for i in range(1, 7)] and told[-1][3] > told[0][3] + 0.1
+    assert climbed(arena("network"), effort) == []
 
 
 def test_programs_around_scripts_hold_them():

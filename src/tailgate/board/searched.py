@@ -24,7 +24,7 @@ from tailgate.core.spec_text import MARKS
 from tailgate.core.threat import KNOWLEDGE
 from tailgate.ensemble import standard
 from tailgate.ensemble.members import MEMBERS
-from tailgate.ensemble.standard import NAME, Progress, jobs_of, searched
+from tailgate.ensemble.standard import EARLIER, NAME, Progress, jobs_of, searched
 from tailgate.evaluation.rows import Row
 from tailgate.training.adaptive import Adaptive, plan_of, stem
 
@@ -164,6 +164,8 @@ def unsearched(table: Table, row: Row, searches: Sequence[Data], plan: Adaptive)
     own = {"digest": row["defence_digest"], "version": row.get("versions", {}).get("defence", 1), "ensemble": NAME, "budget": plan.ensemble}
     own |= {"seed": seed_of(table.beacon)}
     line = dict[str, Any](seed=0, **line) if "seed" not in line else line  # older ones have none
+    if line["ensemble"] in EARLIER:
+        own["ensemble"] = line["ensemble"]
     for name, value in own.items():
         if line[name] != value:
             return f"the ensemble attacked another {name}: {line[name] or 'none'}, not {value or 'none'}"
@@ -174,7 +176,7 @@ def unsearched(table: Table, row: Row, searches: Sequence[Data], plan: Adaptive)
             cell = cells.get((name, dose))
             if cell is None:
                 return f"the ensemble has not attacked it on {name} at dose {dose}"
-            if lacks := _lacking(cell, name in table.nominal()):
+            if lacks := _lacking(cell, name in table.nominal(), EARLIER.get(line["ensemble"], ())):
                 return f"the search on {name} at dose {dose} is not whole: {lacks}"
         here = {attack for cell in line["cells"] if cell["scenario"] == name for one in cell["members"] if (attack := one["attack"])}
         left = set(asked[name]) - table.withdrawn
@@ -187,13 +189,13 @@ def unsearched(table: Table, row: Row, searches: Sequence[Data], plan: Adaptive)
     return ""
 
 
-def _lacking(cell: Data, whole: bool) -> str:
+def _lacking(cell: Data, whole: bool, spared: Collection[str]) -> str:
     """Return what a search has and a cell has not: every member with damage or a reason, and an attack of each knowledge.
 
-    whole: all members search here, so that none may leave it to another scenario.
+    whole: all members search here, so that none may leave it to another scenario. spared: members that it need not have.
     """
     members = {one["member"]: one for one in cell["members"]}
-    if left := [one.name for one in MEMBERS if one.name not in members]:
+    if left := [one.name for one in MEMBERS if one.name not in members and one.name not in spared]:
         return f"no member {left[0]}"
     for name, one in members.items():
         if one["damage"] is None and not one["why"]:

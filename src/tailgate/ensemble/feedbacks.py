@@ -1,11 +1,10 @@
-"""The space of values that follow the road: for each wire the weights of `feedback`, with every trigger, bursts and a later kind."""
+"""Values that follow the road: for each wire the weights of `feedback`, with every trigger, bursts and a later kind."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,11 +15,12 @@ from tailgate.core.draws import Draws
 from tailgate.core.kinds import AIRED, EFFECTS
 from tailgate.core.threat import Brief, receivers
 from tailgate.ensemble.battery import opens
-from tailgate.ensemble.space import LONG, NEVER, TRIGGERS, Space, log_between, pick
+from tailgate.ensemble.space import LONG, NEVER, TRIGGERS, Space
 
 KINDS = Kind.FDI, Kind.DOS_JAM, Kind.DOS_HOLD, Kind.DROPOUT, Kind.NOISE_JAM, Kind.ECHO_DELAY
-GENES = "kind", "later", "targets", "agent", "trigger", "when", "bursts", "burst", "pause", "switch"
-SPREAD = 0.6  # of the weights (logistic): half of them are within two thirds of it
+SIZES = np.array([2.0, 0.5, 0.5, 0.5, 0.5])  # of weights that are drawn: of a constant value more than of one that follows
+TIMES = 4  # numbers of a point behind its weights: trigger, burst, pause, switch
+CHANGES, REPEATS = 0.4, 0.5  # how often a later kind and bursts are drawn
 
 
 class Numbers(NamedTuple):
@@ -67,22 +67,38 @@ class Many:
         on = opened & view.allowed & (count % (one.burst + one.pause) < one.burst)
         raw = fed_back(one.weights, road(view, count, plan.model.dt))
         kind, value = np.where(count < one.switch, one.kind, one.later), np.zeros(raw.shape)
-        for one_kind in KINDS:
-            if EFFECTS[one_kind].valued and one_kind.name.lower() in plan.threat.kinds:
-                value = np.where((kind == one_kind)[:, None, None], sent(plan, one_kind, raw), value)
+        for valued in KINDS:
+            if EFFECTS[valued].valued and valued.name.lower() in plan.threat.kinds:
+                value = np.where((kind == valued)[:, None, None], sent(plan, valued, raw), value)
         target = on[:, None, None] & one.target
         hit = target.any(axis=(1, 2))
         command = Command(np.where(hit, kind, 0).astype(np.int8), target, np.where(target, value, 0.0))
         return Memory(one, opened, count + opened, np.array(view.scene.lead_speed)), command
 
 
+class Choice(NamedTuple):
+    """The choices of an attack that have no neighbours."""
+
+    kind: Kind
+    later: Kind
+    wires: int  # place in `Space.wires`
+    agent: int | None  # None: all that are granted
+    trigger: int  # place in TRIGGERS
+    bursts: bool
+
+
+class Point(NamedTuple):
+    """An attack: its choices, and its weights (w * FEATURES,) and TIMES before they are brought into their ranges."""
+
+    choice: Choice
+    vector: Array
+
+
 @dataclass(frozen=True)
 class Feedbacks:
-    """All attacks of `feedback` that a threat model grants in a scenario. A genome has the numbers of GENES, then the weights."""
+    """All attacks of `feedback` that a threat model grants in a scenario."""
 
     space: Space  # of scripts in the same place
-
-    leads: ClassVar[tuple[int, ...]] = (0,)  # genes that say a family
 
     @property
     def brief(self) -> Brief:
@@ -90,71 +106,77 @@ class Feedbacks:
         return self.space.brief
 
     @cached_property
-    def families(self) -> tuple[Kind, ...]:
-        """The kinds that are granted, and have a receiver; of those without a value, only where another kind may follow."""
+    def kinds(self) -> tuple[Kind, ...]:
+        """The kinds that are granted, and have a receiver; empty if none has a value, or nobody drives."""
         heard = bool(receivers(self.brief).any())
         kinds = [kind for kind in KINDS if kind.name.lower() in self.brief.threat.kinds and (heard or kind not in AIRED)]
         return tuple(kinds) if any(EFFECTS[kind].valued for kind in kinds) and self.space.road else ()
 
     @property
-    def genes(self) -> int:
-        """The numbers of a genome."""
-        return len(GENES) + FEATURES * len(self.brief.model.wires)
+    def wires(self) -> tuple[str, ...]:
+        """The wires of an agent."""
+        return self.brief.model.wires
 
-    def scripts(self, genomes: Array) -> Numbers:
-        """Return the attacks of genomes (B, genes)."""
-        gene, brief, space = dict(zip(GENES, np.moveaxis(genomes, 1, 0), strict=False)), self.brief, self.space
-        count, (agents, wires) = len(genomes), brief.granted.shape
-        centred = np.clip(genomes[:, len(GENES) :], 1e-4, 1.0 - 1e-4)
-        weights = np.round(SPREAD * np.log(centred / (1.0 - centred)), 3).reshape(count, 1, wires, FEATURES)
-        weights = weights * np.array([2.5, 1.0, 1.0, 1.0, 1.0])  # of a constant value more than of one that follows
-        kinds = np.array([int(kind) for kind in self.families])
-        kind, later = kinds[pick(gene["kind"], len(kinds))], kinds[pick(gene["later"] / 0.4, len(kinds))]
-        changes = (gene["later"] < 0.4) & (later != kind)
-        later = np.where(changes, later, kind)
-        target = np.broadcast_to(brief.granted, (count, agents, wires)).copy()
-        chosen, alone = pick(gene["targets"], len(space.wires)), pick(gene["agent"], len(space.agents))
-        for i, names in enumerate(space.wires):
-            if names:
-                target[chosen == i] &= np.array([name in names for name in brief.model.wires])
-        for i, number in enumerate(space.agents):
-            if number is not None:
-                target[alone == i] &= (np.arange(agents) == number)[:, None]
-        air = np.isin(kind, AIRED) | np.isin(later, AIRED)
-        reached = target & receivers(brief)
-        reached = np.where(reached.any(axis=(1, 2), keepdims=True), reached, receivers(brief))
-        target = np.where(air[:, None, None], reached, target)
-        trigger, threshold, start = space.opening(gene["trigger"], gene["when"])
-        many = (gene["bursts"] < 0.3) & (space.budget > 1)
-        return Numbers(
-            np.broadcast_to(weights, (count, agents, wires, FEATURES)).copy(), target, kind, later,
-            np.where(changes, 1 + pick(gene["switch"], max(space.budget, 1)), NEVER), trigger, threshold, start,
-            np.where(many, np.round(log_between(gene["burst"], 1.0, max(space.budget / 2, 1.0))).astype(np.int64), NEVER),
-            np.where(many, np.round(log_between(gene["pause"], 1.0, LONG)).astype(np.int64), 0),
+    def drawn(self, rng: np.random.Generator) -> Point:
+        """Return an attack at random."""
+        space, names = self.space, self.space.triggers
+        kind, later = (self.kinds[int(rng.integers(len(self.kinds)))] for _ in range(2))
+        choice = Choice(
+            kind, later if rng.random() < CHANGES else kind, int(rng.integers(len(space.wires))),
+            space.agents[int(rng.integers(len(space.agents)))], TRIGGERS.index(names[int(rng.integers(len(names)))]),
+            bool(rng.random() < REPEATS and space.budget > 1),
         )  # fmt: skip
+        weights = rng.standard_normal((len(self.wires), FEATURES)) * SIZES
+        return Point(choice, np.concatenate([weights.ravel(), rng.uniform(-1.0, 1.0, TIMES)]))
 
-    def label(self, genome: Array) -> str:
-        """Return a short text of one attack."""
-        return self.text(genome)
+    def numbers(self, points: list[Point]) -> Numbers:
+        """Return the numbers of attacks."""
+        rows = [self._row(point) for point in points]
+        return Numbers(*(np.array(part) for part in zip(*rows, strict=True)))
 
-    def text(self, genome: Array, folder: Path | None = None) -> str:
+    def _row(self, point: Point) -> Numbers:
+        """Return the numbers of one attack, without their first axis."""
+        choice, brief, space = point.choice, self.brief, self.space
+        when, burst, pause, switch = (1.0 / (1.0 + np.exp(-3.0 * point.vector[-TIMES:]))).tolist()  # in (0, 1)
+        weights = np.round(point.vector[:-TIMES].reshape(len(self.wires), FEATURES), 3)
+        names, threat, budget = space.wires[choice.wires], brief.threat, max(space.budget, 1)
+        target = brief.granted & np.array([not names or name in names for name in self.wires])
+        if {choice.kind, choice.later} & set(AIRED):
+            target = target & receivers(brief) if (target & receivers(brief)).any() else receivers(brief)
+        if choice.agent is not None:
+            target = target & (np.arange(len(target)) == choice.agent)[:, None]
+        threshold, start = 0.0, 1
+        if choice.trigger:
+            low, high = space.road[TRIGGERS[choice.trigger]]
+            threshold = round(low + (high - low) * when, 2)
+        else:
+            last = brief.horizon if threat.end is None else min(threat.end, brief.horizon)
+            start = threat.onset + int((last - threat.onset) * when)
+        steps = (
+            choice.kind, choice.later, max(1, int(budget * switch)) if choice.later != choice.kind else NEVER, choice.trigger, start,
+            max(1, round((budget / 2.0) ** burst)) if choice.bursts else NEVER, max(1, round(LONG**pause)) if choice.bursts else 0,
+        )  # fmt: skip
+        kind, later, change, trigger, first, length, rest = (np.array(number, np.int64) for number in steps)
+        everywhere = np.broadcast_to(weights, (*target.shape, FEATURES))
+        return Numbers(everywhere, target, kind, later, change, trigger, np.array(threshold), first, length, rest)
+
+    def text(self, point: Point) -> str:
         """Return the text of one attack, as on the command line."""
-        one, wires = map_leaves(lambda leaf: leaf[0], self.scripts(genome[None])), self.brief.model.wires
-        kind, later = Kind(int(one.kind)), Kind(int(one.later))
-        parts = [f"kind={kind.name.lower()}"]
-        if later != kind:
-            parts += [f"later={later.name.lower()}", f"switch={one.switch}"]
-        hit = np.asarray(one.target.any(axis=0))
-        granted = receivers(self.brief).any(axis=0) if {kind, later} & set(AIRED) else self.brief.granted.any(axis=0)
-        if (hit != granted).any():
-            parts.append(f"targets=[{','.join(name for name, on in zip(wires, hit, strict=True) if on)}]")
-        if len(self.space.agents) > 1 and len(agents := np.flatnonzero(one.target.any(axis=1)).tolist()) == 1:
-            parts.append(f"agents=[{agents[0]}]")
-        name = TRIGGERS[int(one.trigger)]
-        parts.append(f"start_step={one.start}" if name == "time" else f"trigger={name},threshold={float(one.threshold)!r}")
-        if one.burst < NEVER:
+        one, choice = self._row(point), point.choice  # without a first axis
+        parts = [f"kind={choice.kind.name.lower()}"]
+        if choice.later != choice.kind:
+            parts += [f"later={choice.later.name.lower()}", f"switch={one.switch}"]
+        aired, hit = bool({choice.kind, choice.later} & set(AIRED)), np.asarray(one.target.any(axis=0))
+        if (hit != (receivers(self.brief) if aired else self.brief.granted).any(axis=0)).any():
+            parts.append(f"targets=[{','.join(name for name, on in zip(self.wires, hit, strict=True) if on)}]")
+        if choice.agent is not None:
+            parts.append(f"agents=[{choice.agent}]")
+        opening = f"trigger={TRIGGERS[choice.trigger]},threshold={one.threshold!s}" if choice.trigger else f"start_step={one.start}"
+        parts.append(opening)
+        if choice.bursts:
             parts.append(f"burst={one.burst},pause={one.pause}")
-        for wire, held, on in zip(wires, one.weights[0].tolist(), hit, strict=True):
-            if on:
-                parts.append(f"weights.{wire}=[{','.join(f'{number:.4g}' for number in held)}]")
+        if EFFECTS[choice.kind].valued or EFFECTS[choice.later].valued:
+            for name, held, on in zip(self.wires, one.weights[0].tolist(), hit, strict=True):
+                if on:
+                    parts.append(f"weights.{name}=[{','.join(map(str, held))}]")
         return f"feedback:{','.join(parts)}"

@@ -15,6 +15,7 @@ from tailgate.core import Array
 from tailgate.core.registry import Spec, entries
 from tailgate.core.schema import fields_of
 from tailgate.engine.untraceable import Untraceable
+from tailgate.ensemble.climb import Climb, Stage, climbed
 from tailgate.ensemble.gradient import Pace, gradient
 from tailgate.ensemble.networks import FORMS, PUBLISHED, Phase, Race, is_ramp, learned, transferred
 from tailgate.ensemble.search import FINALISTS, Arena, Effort, Found, Meaningless, Tell, search
@@ -32,7 +33,7 @@ class Budget:
 
     scripts: Effort
     programs: Effort
-    feedback: Effort
+    feedback: Climb
     population: int  # of a generation of policies
     phases: tuple[tuple[int, int], ...]  # of the race of policies: generations, and episodes of each member
     pace: Pace  # of the gradient attack
@@ -46,12 +47,19 @@ class Budget:
         """Return the episodes that all members play in a scenario, about; those that do not learn unless `whole`."""
         race = self.race if traced else self.race.shorter()
         races = race.episodes(STARTS, agents) + race.episodes(GREY + PUBLISHED, agents)
-        return self.scripts.episodes(agents) + self.programs.episodes(agents) + self.feedback.episodes(agents) + (races if whole else 0)
+        scripts = self.scripts.episodes(agents) + self.programs.episodes(agents) + self.feedback.sized(agents, traced).episodes
+        return scripts + (races if whole else 0)
 
 
 BUDGETS = {
-    "quick": Budget(Effort(512, 5), Effort(256, 4), Effort(512, 12), 32, ((16, 16), (12, 32), (24, 64)), Pace(256, 1, 8, 64)),
-    "standard": Budget(Effort(2048, 12), Effort(1024, 10), Effort(1024, 40), 64, ((40, 32), (40, 64), (60, 128)), Pace(2048, 2, 20, 128)),
+    "quick": Budget(
+        Effort(512, 5), Effort(256, 4), Climb(2048, (Stage(8, 12), Stage(4, 12), Stage(2, 24))), 32, ((16, 16), (12, 32), (24, 64)),
+        Pace(256, 1, 8, 64),
+    ),
+    "standard": Budget(
+        Effort(2048, 12), Effort(1024, 10), Climb(8192, (Stage(16, 16), Stage(8, 32), Stage(4, 64))), 64, ((40, 32), (40, 64), (60, 128)),
+        Pace(2048, 2, 20, 128),
+    ),
 }
 
 
@@ -81,7 +89,7 @@ class Hunt:
 def _scripts(hunt: Hunt) -> list[str]:
     """Search scripts of every family."""
     space = hunt.arena.space
-    hunt.genomes = search(hunt.arena, space, hunt.budget.scripts, hunt.seed, tell=hunt.tell)
+    hunt.genomes = search(hunt.arena, space, hunt.budget.scripts, hunt.seed, first=space.rhythms, tell=hunt.tell)
     out: dict[str, list[str]] = {}
     for genome in hunt.genomes:
         mine = out.setdefault(space.family(genome).name, [])
@@ -101,9 +109,7 @@ def _programs(hunt: Hunt) -> list[str]:
 
 def _feedback(hunt: Hunt) -> list[str]:
     """Search values that follow the road, of every kind."""
-    space = hunt.arena.feedbacks
-    found = search(hunt.arena, space, hunt.budget.feedback, hunt.seed, tell=hunt.tell)
-    return list(dict.fromkeys(space.text(genome) for genome in found))[:FINALISTS]
+    return climbed(hunt.arena, hunt.budget.feedback, hunt.seed, hunt.tell)
 
 
 def _policies(hunt: Hunt, knowledge: str) -> list[str]:

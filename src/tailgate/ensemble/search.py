@@ -190,13 +190,13 @@ class Arena:
         loop, agents, total = self.loop, self.loop.model.agents, len(scripts[-1])
         keys = draws.keys("tune", range(first, first + episodes))
         each, reach = max(AT_ONCE // (agents * episodes), 1), self.reach("tune", first, episodes)
-        attack, few = _at_start(scripts.take(np.arange(ROWS) % total), agents)
+        attack, few = at_start(scripts.take(np.arange(ROWS) % total), agents)
         battery = battery_of(loop, attack, loop.brief, few)
         out = []
         for begin in range(0, total, each):
             some = np.arange(begin, min(begin + each, total))
             many = Keys(np.tile(keys.key, (len(some), 1)), np.tile(keys[1], len(some)))
-            _, memory = _at_start(scripts.take(np.repeat(some, episodes)), agents)
+            _, memory = at_start(scripts.take(np.repeat(some, episodes)), agents)
             if isinstance(battery, Untraced):
                 played = played_plainly(loop, attack, loop.brief, many, memory)
             else:
@@ -264,7 +264,7 @@ class Arena:
         return sorted(found, key=lambda one: -one.score)
 
 
-def _at_start(scripts: Sequence | Numbers, agents: int) -> tuple[Decider, object]:
+def at_start(scripts: Sequence | Numbers, agents: int) -> tuple[Decider, object]:
     """Return the attack that plays scripts, and its memory at the start of their episodes."""
     if isinstance(scripts, Numbers):
         return Many(), scripts.remembered()
@@ -336,8 +336,7 @@ def _children(pool: Pool, count: int, leads: list[int], rng: np.random.Generator
 
 
 def search(
-    arena: Arena, space: Space | Programs | Feedbacks, effort: Effort, seed: int = 0, *, first: Array | None = None,
-    tell: Tell | None = None,
+    arena: Arena, space: Space | Programs, effort: Effort, seed: int = 0, *, first: Array | None = None, tell: Tell | None = None
 ) -> Array:  # fmt: skip
     """Search the attacks of a space that do most harm.
 
@@ -346,7 +345,7 @@ def search(
     arena
         The defence, and where it is attacked.
     space
-        Scripts, programs or feedbacks.
+        Scripts or programs.
     seed
         The same seed finds the same attacks.
     first

@@ -232,6 +232,23 @@ class Space:
         heard = receivers(self.brief)
         return np.asarray(heard & (np.cumsum(heard, axis=1) == 1)) if self.phase else heard
 
+    @property
+    def rhythms(self) -> Array:
+        """Genomes (P, genes) of single steps of the largest value, from the first step on, with every pause.
+
+        A defence that trusts its sensors again some steps after an alarm falls to one pause and to no other, so a search hardly finds it.
+        """
+        signs, pauses = (0.0, 0.75), np.log(np.arange(1.0, LONG + 1.0)) / np.log(LONG)
+        out = np.zeros((len(self.families), len(signs), LONG, self.genes))
+        gene = dict(zip(GENES, np.moveaxis(out, -1, 0), strict=True))
+        gene["family"][:] = ((np.arange(len(self.families)) + 0.5) / max(len(self.families), 1))[:, None, None]
+        gene["sign"][:] = np.array(signs)[:, None]
+        gene["pause"][:] = pauses
+        for name in ("size", "rate", "hop"):
+            gene[name][:] = np.nextafter(1.0, 0.0)
+        distinct = np.array([[True, bool(one.value) or one.ramp] for one in self.families], bool).reshape(-1, len(signs))
+        return np.minimum(out[distinct & (self.budget > 1)].reshape(-1, self.genes), np.nextafter(1.0, 0.0))
+
     def scripts(self, genomes: Array) -> Sequence:
         """Return the scripts of genomes (B, genes)."""
         return Sequence((self.rows(genomes),), np.full(len(genomes), NEVER))

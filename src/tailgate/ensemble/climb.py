@@ -1,0 +1,144 @@
+"""The search for values that follow the road: random attacks, then CMA-ES (Hansen and Ostermeier 2001) from the best ones."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from tailgate.core import Array, Kind
+from tailgate.ensemble.feedbacks import Choice, Feedbacks, Point
+from tailgate.ensemble.search import FINALISTS, FIRST, PROMISING, Arena, Tell
+
+if TYPE_CHECKING:
+    from cmaes import CMA
+
+EPISODES, AGAIN = 32, 256  # of an attack, and of one that is compared in the end
+GROUP, STEP = 16, 0.4  # attacks of a run in a round, and their first spread
+BEST, ENDS = 64, 48  # random attacks among which runs begin, and attacks that are compared in the end
+LEAST, SHORTER = 2, 4  # runs at least; the part of a search that is played in the plain loop
+
+
+class Stage(NamedTuple):
+    """Rounds of the runs that did best so far."""
+
+    runs: int
+    rounds: int
+
+
+@dataclass(frozen=True)
+class Climb:
+    """The size of a search: random attacks, for a system of one agent, and the stages of the runs."""
+
+    random: int
+    stages: tuple[Stage, ...]
+
+    def sized(self, agents: int, traced: bool = True) -> Climb:
+        """Return the search for a system of this size."""
+        part = agents * (1 if traced else SHORTER)
+        stages = (Stage(max(runs // agents, LEAST), max(rounds // (1 if traced else SHORTER), 1)) for runs, rounds in self.stages)
+        return Climb(max(self.random // part, BEST), tuple(stages))
+
+    @property
+    def episodes(self) -> int:
+        """The episodes that the search plays."""
+        again = max(self.random // PROMISING, BEST) + GROUP * sum(runs * rounds for runs, rounds in self.stages)
+        return FIRST * self.random + EPISODES * again + AGAIN * ENDS
+
+
+class Run(NamedTuple):
+    """A distribution of the numbers of attacks that have the same choices."""
+
+    choice: Choice
+    method: CMA
+
+
+class Ended(NamedTuple):
+    """An attack, and its mean score when it was tried."""
+
+    score: float
+    point: Point
+
+
+def climbed(arena: Arena, effort: Climb, seed: int = 0, tell: Tell | None = None) -> list[str]:
+    """Search the values that follow the road and do most harm; the same seed finds the same.
+
+    Parameters
+    ----------
+    effort
+        The size of the search, for a system of one agent.
+    tell
+        Called after each round with its number, their count, the best attack so far and its mean score.
+
+    Returns
+    -------
+    list of str
+        Attacks as on the command line, the most harmful first. Empty where the threat model grants none.
+    """
+    space, effort = arena.feedbacks, effort.sized(arena.loop.model.agents, arena.traced)
+    if not space.kinds:
+        return []
+    rng = np.random.default_rng([seed, zlib.crc32(f"{arena.name}/{arena.dose}/{arena.defence}".encode()), 77])
+    game, rounds, done = _Game(arena, space), sum(stage.rounds for stage in effort.stages), 0
+    tried = game.tried([space.drawn(rng) for _ in range(effort.random)], FIRST)
+    tried = game.tried([one.point for one in tried[: max(effort.random // PROMISING, BEST)]])
+    runs, ends = [_run(point, rng) for point in _apart(tried, effort.stages[0].runs)], tried[:ENDS]
+    for stage in effort.stages:
+        best = {one.point.choice: one.score for one in reversed(ends)}
+        runs = sorted(runs, key=lambda run: -best.get(run.choice, 0.0))[: stage.runs]
+        for _ in range(stage.rounds):
+            ends = sorted([*ends, *game.moved(runs)], key=lambda one: -one.score)[:ENDS]
+            done += 1
+            if tell is not None:
+                tell(done, rounds, space.text(ends[0].point), ends[0].score)
+    last = game.tried([one.point for one in ends], AGAIN)
+    return list(dict.fromkeys(space.text(one.point) for one in last))[:FINALISTS]
+
+
+@dataclass
+class _Game:
+    """Plays attacks on episodes that the search has not played before."""
+
+    arena: Arena
+    space: Feedbacks
+    episode: int = 0
+
+    def scores(self, points: list[Point], episodes: int) -> Array:
+        """Return the mean score (points,) of each attack over the same episodes."""
+        first, self.episode = self.episode, self.episode + episodes
+        return self.arena.scores(self.space.numbers(points), first, episodes) / episodes
+
+    def tried(self, points: list[Point], episodes: int = EPISODES) -> list[Ended]:
+        """Play attacks; return them with their scores, the most harmful first."""
+        ended = [Ended(float(score), point) for score, point in zip(self.scores(points, episodes), points, strict=True)]
+        return sorted(ended, key=lambda one: -one.score)
+
+    def moved(self, runs: list[Run]) -> list[Ended]:
+        """Play the next attacks of runs on the same episodes, and move; return each run's best, and its mean with the same score."""
+        asked = [[run.method.ask() for _ in range(GROUP)] for run in runs]
+        points = [Point(run.choice, vector) for run, mine in zip(runs, asked, strict=True) for vector in mine]
+        paid, out = self.scores(points, EPISODES).reshape(len(runs), GROUP), []
+        for run, mine, score in zip(runs, asked, paid, strict=True):
+            run.method.tell([(vector, -float(one)) for vector, one in zip(mine, score, strict=True)])
+            top = int(np.argmax(score))
+            out += [Ended(float(score[top]), Point(run.choice, vector)) for vector in (mine[top], np.array(run.method.mean))]
+        return out
+
+
+def _apart(ends: list[Ended], count: int) -> list[Point]:
+    """Return the best attacks that differ in their kind or in bursts, then those that differ in another choice."""
+    kinds: dict[tuple[Kind, bool], Point] = {}
+    choices: dict[Choice, Point] = {}
+    for _, point in ends:
+        kinds.setdefault((point.choice.kind, point.choice.bursts), point)
+        choices.setdefault(point.choice, point)
+    return list({point.choice: point for point in [*kinds.values(), *choices.values()]}.values())[:count]
+
+
+def _run(point: Point, rng: np.random.Generator) -> Run:
+    """Return a run that begins at an attack."""
+    from cmaes import CMA  # imports scipy's statistics
+
+    return Run(point.choice, CMA(mean=point.vector, sigma=STEP, population_size=GROUP, seed=int(rng.integers(1 << 30))))
