@@ -102,7 +102,7 @@ class Feedbacks:
 
     @property
     def brief(self) -> Brief:
-        """What the attacker is granted."""
+        """The grant of the attacker."""
         return self.space.brief
 
     @cached_property

@@ -236,7 +236,7 @@ class Space:
     def rhythms(self) -> Array:
         """Genomes (P, genes) of single steps of the largest value, from the first step on, with every pause.
 
-        A defence that trusts its sensors again some steps after an alarm falls to one pause and to no other, so a search hardly finds it.
+        A defence may trust its sensors again some steps after an alarm. One pause alone defeats it, and a search hardly finds that one.
         """
         signs, pauses = (0.0, 0.75), np.log(np.arange(1.0, LONG + 1.0)) / np.log(LONG)
         out = np.zeros((len(self.families), len(signs), LONG, self.genes))
