@@ -3,7 +3,8 @@
     python benchmarks/searched_again.py radar-v1 [--budget quick] [--seed 0] [--workers 2] [--json FILE]
 
 Each ranked figure at black box that leaves more than 10 % undamaged is searched: `scripts` in every scenario, `feedback` in that of
-its worst attack. The best attack of a figure then meets 2000 fresh episodes. The same seed finds the same attacks.
+its worst attack. There all attacks are played as well that the board's searches found against other defences at the same dose.
+The best attack of a figure then meets 2000 fresh episodes. The same seed finds the same attacks.
 """
 
 from __future__ import annotations
@@ -32,14 +33,23 @@ class Figure(NamedTuple):
     scenario: str  # of its worst attack
     attack: str
     published: float  # share of damaged episodes
+    others: tuple[str, ...]  # attacks that were found against other defences in the same place
 
 
 def figures(name: str, board: dict[str, Any]) -> list[Figure]:
     """Return the figures of a board that can fall."""
+    def others(scenario: str, dose: int, defence: str) -> tuple[str, ...]:
+        cells = [cell for line in board["searches"] if line["defence"] != defence for cell in line["cells"]]
+        cells = [cell for cell in cells if (cell["scenario"], cell["dose"]) == (scenario, dose)]
+        members = [one for cell in cells for one in cell["members"] if one["knowledge"] == "black" or one["member"] == "gradient"]
+        return tuple(dict.fromkeys(one["attack"] for one in members if one["attack"]))
+
     return [
-        Figure(name, entry["defence"], rate["dose"], rate["worst"]["scenario"], rate["worst"]["attack"], 1.0 - rate["undamaged"]["value"])
-        for entry in board["entries"] if entry["rank"] is not None for rate in entry["rates"]
-        if rate["knowledge"] == "black" and rate["undamaged"] and rate["undamaged"]["value"] > 0.1
+        Figure(
+            name, entry["defence"], rate["dose"], worst["scenario"], worst["attack"], 1.0 - rate["undamaged"]["value"],
+            others(worst["scenario"], rate["dose"], entry["defence"]),
+        ) for entry in board["entries"] if entry["rank"] is not None for rate in entry["rates"]
+        for worst in [rate["worst"]] if rate["knowledge"] == "black" and rate["undamaged"] and rate["undamaged"]["value"] > 0.1
     ]  # fmt: skip
 
 
@@ -50,11 +60,13 @@ def searched(figure: Figure, budget: str, seed: int) -> dict[str, Any]:
         for place in suite.scenarios:
             arena = Arena(suite.name, place, figure.dose, figure.defence, dict(suite.granted), suite.bound, suite.progress)
             only = ("scripts", "feedback") if place == figure.scenario else ("scripts",)
-            for one in harvest(Hunt(arena, BUDGETS[budget], seed, Path(folder), only=only)):
-                for attack in one.found[:1]:
-                    found.append((arena.confirmed(attack.attack, "report", FIRST_FRESH, FRESH)[0], place, attack.attack))
+            best = [one.found[0].attack for one in harvest(Hunt(arena, BUDGETS[budget], seed, Path(folder), only=only)) if one.found]
+            if place == figure.scenario:
+                best += arena.promising(figure.others, 1)
+            found += [(arena.confirmed(attack, "report", FIRST_FRESH, FRESH)[0], place, attack) for attack in best]
     damage, place, attack = max(found)
-    return figure._asdict() | {"published_attack": figure.attack, "found": damage, "found_in": place, "attack": attack}
+    row = figure._asdict() | {"published_attack": figure.attack, "found": damage, "found_in": place, "attack": attack}
+    return {name: row[name] for name in row if name != "others"}
 
 
 def main() -> None:

@@ -198,7 +198,7 @@ def test_the_published_head_is_that_of_the_published_board() -> None:
     from tailgate.board.head import markdown
 
     found = []
-    older = ["car-following-v1/board.json.xz", "radar-v1/board.json.xz", "lane-v0/board.json.xz", "road-v0/board.json.xz", "quick-v0/board.json", "car-following-v0/board.json"]
+    older = ["car-following-v1/board.json.xz", "radar-v1/board.json.xz", "lane-v0/board.json.xz", "road-v0/board.json.xz", "network-v1/board.json.xz", "quick-v0/board.json", "car-following-v0/board.json"]
     for page, boards in (("README.md", ["quick-v1/board.json.xz"]), ("docs/boards.md", older)):
         heads = re.findall(r"<!-- head: (\S+) -->\n(.*?)<!-- end -->", (ROOT / page).read_text(encoding="utf-8"), flags=re.S)
         assert [name for name, _ in heads] == [f"results/{board}" for board in boards]

@@ -10,11 +10,12 @@ import numpy as np
 
 from tailgate.core import Array, Kind
 from tailgate.ensemble.feedbacks import Choice, Feedbacks, Point
-from tailgate.ensemble.search import FINALISTS, FIRST, PROMISING, Arena, Tell
+from tailgate.ensemble.search import FINALISTS, PROMISING, Arena, Tell
 
 if TYPE_CHECKING:
     from cmaes import CMA
 
+SCREENS = 4, 16  # episodes of every random attack, and of the best ones
 EPISODES, AGAIN = 32, 256  # of an attack, and of one that is compared in the end
 GROUP, STEP = 16, 0.4  # attacks of a run in a round, and their first spread
 BEST, ENDS = 64, 48  # random attacks among which runs begin, and attacks that are compared in the end
@@ -42,10 +43,16 @@ class Climb:
         return Climb(max(self.random // part, BEST), tuple(stages))
 
     @property
+    def screened(self) -> tuple[int, ...]:
+        """How many random attacks are left after each screen."""
+        return tuple(max(self.random // PROMISING**i, BEST) for i in range(1, len(SCREENS) + 1))
+
+    @property
     def episodes(self) -> int:
         """The episodes that the search plays."""
-        again = max(self.random // PROMISING, BEST) + GROUP * sum(runs * rounds for runs, rounds in self.stages)
-        return FIRST * self.random + EPISODES * again + AGAIN * ENDS
+        tried = (self.random, *self.screened), (*SCREENS, EPISODES)
+        runs = GROUP * sum(runs * rounds for runs, rounds in self.stages)
+        return sum(count * each for count, each in zip(*tried, strict=True)) + EPISODES * runs + AGAIN * ENDS
 
 
 class Run(NamedTuple):
@@ -82,8 +89,10 @@ def climbed(arena: Arena, effort: Climb, seed: int = 0, tell: Tell | None = None
         return []
     rng = np.random.default_rng([seed, zlib.crc32(f"{arena.name}/{arena.dose}/{arena.defence}".encode()), 77])
     game, rounds, done = _Game(arena, space), sum(stage.rounds for stage in effort.stages), 0
-    tried = game.tried([space.drawn(rng) for _ in range(effort.random)], FIRST)
-    tried = game.tried([one.point for one in tried[: max(effort.random // PROMISING, BEST)]])
+    points = [space.drawn(rng) for _ in range(effort.random)]
+    for episodes, left in zip(SCREENS, effort.screened, strict=True):
+        points = [one.point for one in game.tried(points, episodes)[:left]]
+    tried = game.tried(points)
     runs, ends = [_run(point, rng) for point in _apart(tried, effort.stages[0].runs)], tried[:ENDS]
     for stage in effort.stages:
         best = {one.point.choice: one.score for one in reversed(ends)}

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tailgate.agents.scripts.feedback import FEATURES, fed_back, road, sent
+from tailgate.agents.scripts.feedback import FEATURES, UNIT, fed_back, road, sent
 from tailgate.base.pytree import map_leaves
 from tailgate.core import Array, Command, Kind, View
 from tailgate.core.draws import Draws
@@ -18,9 +18,10 @@ from tailgate.ensemble.battery import opens
 from tailgate.ensemble.space import LONG, NEVER, TRIGGERS, Space
 
 KINDS = Kind.FDI, Kind.DOS_JAM, Kind.DOS_HOLD, Kind.DROPOUT, Kind.NOISE_JAM, Kind.ECHO_DELAY
+WIRES = 0.3  # how often these spare a wire
 SIZES = np.array([2.0, 0.5, 0.5, 0.5, 0.5])  # of weights that are drawn: of a constant value more than of one that follows
 TIMES = 4  # numbers of a point behind its weights: trigger, burst, pause, switch
-CHANGES, REPEATS = 0.4, 0.5  # how often a later kind and bursts are drawn
+CHANGES, REPEATS, PULSES = 0.4, 0.5, 0.5  # how often a later kind, bursts, and single steps of constants are drawn
 
 
 class Numbers(NamedTuple):
@@ -126,8 +127,16 @@ class Feedbacks:
             space.agents[int(rng.integers(len(space.agents)))], TRIGGERS.index(names[int(rng.integers(len(names)))]),
             bool(rng.random() < REPEATS and space.budget > 1),
         )  # fmt: skip
-        weights = rng.standard_normal((len(self.wires), FEATURES)) * SIZES
-        return Point(choice, np.concatenate([weights.ravel(), rng.uniform(-1.0, 1.0, TIMES)]))
+        weights, times = rng.standard_normal((len(self.wires), FEATURES)) * SIZES, rng.uniform(-1.0, 1.0, TIMES)
+        if rng.random() < PULSES and space.budget > 1:  # another constant on each wire, in single steps
+            valued = [one for one in self.kinds if EFFECTS[one].valued]
+            kind = valued[int(rng.integers(len(valued)))]
+            choice = choice._replace(kind=kind, later=kind, wires=choice.wires if rng.random() < WIRES else 0, bursts=True)
+            most = np.arcsinh(space.reach(kind)[1] / UNIT)
+            weights = np.zeros(weights.shape) + rng.uniform(-most, most, len(weights))[:, None] * np.eye(FEATURES)[0]
+            share = np.clip(np.log(rng.integers(1, LONG + 1)) / np.log(LONG), 0.01, 0.99)
+            times[1:3] = -1.0, np.log(share / (1.0 - share)) / 3.0
+        return Point(choice, np.concatenate([weights.ravel(), times]))
 
     def numbers(self, points: list[Point]) -> Numbers:
         """Return the numbers of attacks."""

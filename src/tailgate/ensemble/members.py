@@ -53,11 +53,11 @@ class Budget:
 
 BUDGETS = {
     "quick": Budget(
-        Effort(512, 5), Effort(256, 4), Climb(2048, (Stage(8, 12), Stage(4, 12), Stage(2, 24))), 32, ((16, 16), (12, 32), (24, 64)),
+        Effort(512, 5), Effort(256, 4), Climb(8192, (Stage(8, 12), Stage(4, 12), Stage(2, 24))), 32, ((16, 16), (12, 32), (24, 64)),
         Pace(256, 1, 8, 64),
     ),
     "standard": Budget(
-        Effort(2048, 12), Effort(1024, 10), Climb(8192, (Stage(16, 16), Stage(8, 32), Stage(4, 64))), 64, ((40, 32), (40, 64), (60, 128)),
+        Effort(2048, 12), Effort(1024, 10), Climb(32768, (Stage(16, 16), Stage(8, 32), Stage(4, 64))), 64, ((40, 32), (40, 64), (60, 128)),
         Pace(2048, 2, 20, 128),
     ),
 }
