@@ -119,7 +119,7 @@ def test_a_row_plays_what_the_file_of_its_program_says(name, tmp_path):
 def test_a_row_plays_what_the_text_of_its_feedback_says(name):
     """With every kind, trigger and set of wires."""
     place, rng, attacked = arena(name), np.random.default_rng(9), 0
-    points = [place.feedbacks.drawn(rng) for _ in range(16)]
+    points = [place.feedbacks.drawn(rng) for _ in range(24)]
     outcome = played(place, place.feedbacks.numbers(points))
     for i, text in enumerate(map(place.feedbacks.text, points)):
         wanted, on = as_evaluated(place, text)

@@ -80,7 +80,7 @@ def test_a_notebook_shows_the_head_of_a_board():
     board = load("quick-v1")
     page, head = board._repr_html_(), lines(board)
     assert page.count("<tr>") == len(head) and "<th>defence</th>" in page and all(f"<td>{line[0]}</td>" in page for line in head[1:])
-    assert repr(board) == "Board quick-v1 of 20 defences and 564 cells; a mapping, .to_pandas()"
+    assert repr(board) == "Board quick-v1 of 20 defences and 604 cells; a mapping, .to_pandas()"
     wild = BoardData(json.loads(json.dumps(board).replace('"always_brake"', '"<b>brake"')))
     assert "&lt;b&gt;brake" in wild._repr_html_() and "<b>" not in wild._repr_html_()
 
