@@ -16,9 +16,9 @@ def add(commands: Commands) -> None:
     """Add the command."""
     command = commands.add_parser(
         "attack", help="find the attacks that do most harm to a defence, and compare them with a suite's",
-        description="Attack a defence with the standard ensemble: searched scripts and programs, published and newly learned policies, and "
-        "attacks that know the defence. In each scenario, at each dose, the best of every member is compared with the best attack that the "
-        "suite lists, on fresh episodes.",
+        description="Attack a defence with the standard ensemble: searched scripts, programs and feedbacks, published and newly learned "
+        "policies, and attacks that know the defence. In each scenario, at each dose, the best of every member is compared with the best "
+        "attack that the suite lists, on fresh episodes.",
     )  # fmt: skip
     command.add_argument("defence", metavar="NAME", help="defence to attack; a class: module:Class, or bwrap/module:Class")
     command.add_argument("--suite", default="quick-v0", metavar="NAME", help="suite by name or YAML file (default: quick-v0)")
