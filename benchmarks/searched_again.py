@@ -3,8 +3,9 @@
     python benchmarks/searched_again.py radar-v1 [--budget quick] [--seed 0] [--workers 2] [--json FILE]
 
 Each ranked figure at black box that leaves more than 10 % undamaged is searched: `scripts` in every scenario, `feedback` in that of
-its worst attack. There all attacks are played as well that the board's searches found against other defences at the same dose.
-The best attack of a figure then meets 2000 fresh episodes. The same seed finds the same attacks.
+its worst attack, or in every one if nothing does harm yet. There all attacks are played as well that the board's searches found against
+other defences at the same dose. The best attack of each search then meets 2000 fresh episodes. The same seed finds the same attacks.
+Run it from the folder of the repository, where the files of attacks are.
 """
 
 from __future__ import annotations
@@ -33,21 +34,22 @@ class Figure(NamedTuple):
     scenario: str  # of its worst attack
     attack: str
     published: float  # share of damaged episodes
-    others: tuple[str, ...]  # attacks that were found against other defences in the same place
+    others: dict[str, tuple[str, ...]]  # attacks that were found against other defences at this dose, by scenario
 
 
 def figures(name: str, board: dict[str, Any]) -> list[Figure]:
     """Return the figures of a board that can fall."""
-    def others(scenario: str, dose: int, defence: str) -> tuple[str, ...]:
-        cells = [cell for line in board["searches"] if line["defence"] != defence for cell in line["cells"]]
-        cells = [cell for cell in cells if (cell["scenario"], cell["dose"]) == (scenario, dose)]
-        members = [one for cell in cells for one in cell["members"] if one["knowledge"] == "black" or one["member"] == "gradient"]
-        return tuple(dict.fromkeys(one["attack"] for one in members if one["attack"]))
+    def others(defence: str, dose: int) -> dict[str, tuple[str, ...]]:
+        found: dict[str, dict[str, None]] = {}
+        for cell in (cell for line in board["searches"] if line["defence"] != defence for cell in line["cells"] if cell["dose"] == dose):
+            members = [one for one in cell["members"] if one["knowledge"] == "black" or one["member"] == "gradient"]
+            found.setdefault(cell["scenario"], {}).update({one["attack"]: None for one in members if one["attack"]})
+        return {scenario: tuple(attacks) for scenario, attacks in found.items()}
 
     return [
         Figure(
             name, entry["defence"], rate["dose"], worst["scenario"], worst["attack"], 1.0 - rate["undamaged"]["value"],
-            others(worst["scenario"], rate["dose"], entry["defence"]),
+            others(entry["defence"], rate["dose"]),
         ) for entry in board["entries"] if entry["rank"] is not None for rate in entry["rates"]
         for worst in [rate["worst"]] if rate["knowledge"] == "black" and rate["undamaged"] and rate["undamaged"]["value"] > 0.1
     ]  # fmt: skip
@@ -59,14 +61,14 @@ def searched(figure: Figure, budget: str, seed: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         for place in suite.scenarios:
             arena = Arena(suite.name, place, figure.dose, figure.defence, dict(suite.granted), suite.bound, suite.progress)
-            only = ("scripts", "feedback") if place == figure.scenario else ("scripts",)
+            here = place == figure.scenario or not figure.published
+            only = ("scripts", "feedback") if here else ("scripts",)
             best = [one.found[0].attack for one in harvest(Hunt(arena, BUDGETS[budget], seed, Path(folder), only=only)) if one.found]
-            if place == figure.scenario:
-                best += arena.promising(figure.others, 1)
+            best += arena.promising(figure.others.get(place, ()), 1) if here else []
             found += [(arena.confirmed(attack, "report", FIRST_FRESH, FRESH)[0], place, attack) for attack in best]
-    damage, place, attack = max(found)
+    damage, place, attack = max(found, key=lambda one: one[0])
     row = figure._asdict() | {"published_attack": figure.attack, "found": damage, "found_in": place, "attack": attack}
-    return {name: row[name] for name in row if name != "others"}
+    return {name: row[name] for name in row if name != "others"} | {"budget": budget, "seed": seed}
 
 
 def main() -> None:

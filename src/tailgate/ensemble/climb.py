@@ -63,7 +63,7 @@ class Run(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """An attack, and its mean score when it was tried."""
+    """An attack, and its mean score; the mean of a run has that of the best attack around it."""
 
     score: float
     point: Point

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tailgate.agents.scripts.feedback import FEATURES, UNIT, fed_back, road, sent
+from tailgate.agents.scripts.feedback import FEATURES, STEEPEST, UNIT, fed_back, road, sent
 from tailgate.base.pytree import map_leaves
 from tailgate.core import Array, Command, Kind, View
 from tailgate.core.draws import Draws
@@ -17,10 +17,11 @@ from tailgate.core.threat import Brief, receivers
 from tailgate.ensemble.battery import opens
 from tailgate.ensemble.space import LONG, NEVER, TRIGGERS, Space
 
-KINDS = Kind.FDI, Kind.DOS_JAM, Kind.DOS_HOLD, Kind.DROPOUT, Kind.NOISE_JAM, Kind.ECHO_DELAY
-WIRES = 0.3  # how often these spare a wire
+KINDS = Kind.FDI, Kind.DOS_JAM, Kind.DOS_HOLD, Kind.DROPOUT, Kind.NOISE_JAM, Kind.ECHO_DELAY  # a fresh hold is left to scripts
+SPARING = 0.3  # how often single steps of constants leave out a wire
 SIZES = np.array([2.0, 0.5, 0.5, 0.5, 0.5])  # of weights that are drawn: of a constant value more than of one that follows
 TIMES = 4  # numbers of a point behind its weights: trigger, burst, pause, switch
+STEEP, INNER = 3.0, 1e-3  # these are logistic: their steepness, and the least share of a range
 CHANGES, REPEATS, PULSES = 0.4, 0.5, 0.5  # how often a later kind, bursts, and single steps of constants are drawn
 
 
@@ -97,7 +98,7 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True)
 class Feedbacks:
-    """All attacks of `feedback` that a threat model grants in a scenario."""
+    """Attacks of `feedback` that a threat model grants in a scenario."""
 
     space: Space  # of scripts in the same place
 
@@ -127,16 +128,16 @@ class Feedbacks:
             space.agents[int(rng.integers(len(space.agents)))], TRIGGERS.index(names[int(rng.integers(len(names)))]),
             bool(rng.random() < REPEATS and space.budget > 1),
         )  # fmt: skip
-        weights, times = rng.standard_normal((len(self.wires), FEATURES)) * SIZES, rng.uniform(-1.0, 1.0, TIMES)
+        weights, shares = rng.standard_normal((len(self.wires), FEATURES)) * SIZES, rng.uniform(0.0, 1.0, TIMES)
         if rng.random() < PULSES and space.budget > 1:  # another constant on each wire, in single steps
             valued = [one for one in self.kinds if EFFECTS[one].valued]
             kind = valued[int(rng.integers(len(valued)))]
-            choice = choice._replace(kind=kind, later=kind, wires=choice.wires if rng.random() < WIRES else 0, bursts=True)
-            most = np.arcsinh(space.reach(kind)[1] / UNIT)
+            choice = choice._replace(kind=kind, later=kind, wires=choice.wires if rng.random() < SPARING else 0, bursts=True)
+            most = min(np.arcsinh(space.reach(kind)[1] / UNIT), STEEPEST)
             weights = np.zeros(weights.shape) + rng.uniform(-most, most, len(weights))[:, None] * np.eye(FEATURES)[0]
-            share = np.clip(np.log(rng.integers(1, LONG + 1)) / np.log(LONG), 0.01, 0.99)
-            times[1:3] = -1.0, np.log(share / (1.0 - share)) / 3.0
-        return Point(choice, np.concatenate([weights.ravel(), times]))
+            shares[1:3] = 0.0, np.log(rng.integers(1, LONG + 1)) / np.log(LONG)
+        shares = np.clip(shares, INNER, 1.0 - INNER)
+        return Point(choice, np.concatenate([weights.ravel(), np.log(shares / (1.0 - shares)) / STEEP]))
 
     def numbers(self, points: list[Point]) -> Numbers:
         """Return the numbers of attacks."""
@@ -146,28 +147,23 @@ class Feedbacks:
     def _row(self, point: Point) -> Numbers:
         """Return the numbers of one attack, without their first axis."""
         choice, brief, space = point.choice, self.brief, self.space
-        when, burst, pause, switch = (1.0 / (1.0 + np.exp(-3.0 * point.vector[-TIMES:]))).tolist()  # in (0, 1)
+        when, burst, pause, switch = (1.0 / (1.0 + np.exp(-STEEP * point.vector[-TIMES:]))).tolist()  # in (0, 1)
         weights = np.round(point.vector[:-TIMES].reshape(len(self.wires), FEATURES), 3)
-        names, threat, budget = space.wires[choice.wires], brief.threat, max(space.budget, 1)
+        names, budget = space.wires[choice.wires], max(space.budget, 1)
         target = brief.granted & np.array([not names or name in names for name in self.wires])
         if {choice.kind, choice.later} & set(AIRED):
             target = target & receivers(brief) if (target & receivers(brief)).any() else receivers(brief)
         if choice.agent is not None:
             target = target & (np.arange(len(target)) == choice.agent)[:, None]
-        threshold, start = 0.0, 1
-        if choice.trigger:
-            low, high = space.road[TRIGGERS[choice.trigger]]
-            threshold = round(low + (high - low) * when, 2)
-        else:
-            last = brief.horizon if threat.end is None else min(threat.end, brief.horizon)
-            start = threat.onset + int((last - threat.onset) * when)
+        place = (space.triggers.index(TRIGGERS[choice.trigger]) + 0.5) / len(space.triggers)
+        _, threshold, start = (part[0] for part in space.opening(np.array([place]), np.array([when])))
         steps = (
             choice.kind, choice.later, max(1, int(budget * switch)) if choice.later != choice.kind else NEVER, choice.trigger, start,
             max(1, round((budget / 2.0) ** burst)) if choice.bursts else NEVER, max(1, round(LONG**pause)) if choice.bursts else 0,
         )  # fmt: skip
         kind, later, change, trigger, first, length, rest = (np.array(number, np.int64) for number in steps)
         everywhere = np.broadcast_to(weights, (*target.shape, FEATURES))
-        return Numbers(everywhere, target, kind, later, change, trigger, np.array(threshold), first, length, rest)
+        return Numbers(everywhere, target, kind, later, change, trigger, threshold, first, length, rest)
 
     def text(self, point: Point) -> str:
         """Return the text of one attack, as on the command line."""

@@ -109,6 +109,8 @@ def _programs(hunt: Hunt) -> list[str]:
 
 def _feedback(hunt: Hunt) -> list[str]:
     """Search values that follow the road, of every kind."""
+    if not hunt.arena.space.road:
+        raise Meaningless("scenario", hunt.arena.name, "one with a road: nobody drives here")
     return climbed(hunt.arena, hunt.budget.feedback, hunt.seed, hunt.tell)
 
 
@@ -165,8 +167,8 @@ MEMBERS = (
     Member("programs", "black", _programs, 7),
     Member("feedback", "black", _feedback, 10),
     Member("transfer", "black", _transfer, 1),
-    Member("networks", "black", lambda hunt: _policies(hunt, "black"), 48, learns=True),
-    Member("grey networks", "grey", lambda hunt: _policies(hunt, "grey"), 30, learns=True),
+    Member("networks", "black", lambda hunt: _policies(hunt, "black"), 42, learns=True),
+    Member("grey networks", "grey", lambda hunt: _policies(hunt, "grey"), 26, learns=True),
     Member("white box", "white", _white_box, 3),
     Member("gradient", "white", _gradient, 4, learns=True),
 )

@@ -23,6 +23,7 @@ TRIGGERS = ("time", "near", "speed", "slow", "closing", "leader_braking")
 MOST_SETS = 12  # sets of wires, at most; of many wires only single ones and all
 SMALL = 1e-3  # of a bound: the smallest magnitude that is tried
 LONG = 30  # longest pause between two bursts [steps]
+SIGNED = Kind.FDI, Kind.DOS_JAM  # kinds whose values have a sign
 NEVER = 1 << 30  # a length that no episode has [steps]
 GENES = (
     "family", "targets", "agent", "trigger", "when", "bursts", "burst", "pause", "sign", "size", "rate_sign", "rate", "switch", "hop",
@@ -111,12 +112,12 @@ def _short(values: Array) -> Array:
     return np.array([float(f"{value:.4g}") for value in values.tolist()])
 
 
-def pick(gene: Array, count: int) -> Array:
+def _pick(gene: Array, count: int) -> Array:
     """Return for each gene a place among `count`."""
     return np.minimum((gene * count).astype(np.int64), count - 1)
 
 
-def log_between(gene: Array, low: float, high: float) -> Array:
+def _log(gene: Array, low: float, high: float) -> Array:
     """Return numbers between low and high, log-uniform for a uniform gene."""
     return np.asarray(low * (high / low) ** gene)
 
@@ -179,20 +180,20 @@ class Space:
         """Return the numbers of the scripts of genomes (B, genes)."""
         gene = dict(zip(GENES, np.moveaxis(genomes, 1, 0), strict=True))
         count, brief = len(genomes), self.brief
-        family, wires, agent = (pick(gene[name], len(of)) for name, of in
+        family, wires, agent = (_pick(gene[name], len(of)) for name, of in
                                 (("family", self.families), ("targets", self.wires), ("agent", self.agents)))  # fmt: skip
         base, rate = np.zeros(count), np.zeros(count)
         target = np.zeros((count, *brief.granted.shape), bool)
         for i, one in enumerate(self.families):
             here = family == i
             low, high = self.reach(one.kind)
-            size = log_between(gene["size"][here], low, high)
-            signed = one.kind in (Kind.FDI, Kind.DOS_JAM)
+            size = _log(gene["size"][here], low, high)
+            signed = one.kind in SIGNED
             value = np.where(gene["sign"][here] < 0.5, -size, size) if signed else size
             base[here] = np.round(value) if one.whole else _short(value)
             if one.ramp:
                 fastest = max(2.0 * high / max(self.budget, 1), low)
-                growth = log_between(gene["rate"][here], min(SMALL * high, 0.5 * fastest), fastest)
+                growth = _log(gene["rate"][here], min(SMALL * high, 0.5 * fastest), fastest)
                 rate[here] = _short(np.where(gene["rate_sign"][here] < 0.5, -growth, growth) if signed else growth)
             target[here] = self._aired if one.air else brief.granted
         free = ~np.array([f.air for f in self.families])[family] | (not self.phase)  # a phase over the air hits all that a receiver reads
@@ -208,22 +209,22 @@ class Space:
                         ((f.kind for f in self.families), (f.then or f.kind for f in self.families)))  # fmt: skip
         return Rows(
             kinds[family], thens[family],
-            np.where(kinds[family] == thens[family], NEVER, 1 + pick(gene["switch"], max(self.budget, 1))), target, base, rate,
+            np.where(kinds[family] == thens[family], NEVER, 1 + _pick(gene["switch"], max(self.budget, 1))), target, base, rate,
             trigger, threshold, start,
-            np.where(many, np.round(log_between(gene["burst"], 1.0, max(self.budget / 2, 1.0))).astype(np.int64), NEVER),
-            np.where(many, np.round(log_between(gene["pause"], 1.0, LONG)).astype(np.int64), 0),
+            np.where(many, np.round(_log(gene["burst"], 1.0, max(self.budget / 2, 1.0))).astype(np.int64), NEVER),
+            np.where(many, np.round(_log(gene["pause"], 1.0, LONG)).astype(np.int64), 0),
             (gene["hop"] < 0.3) & np.array([f.air for f in self.families])[family] & (not self.phase),
         )  # fmt: skip
 
     def opening(self, trigger_gene: Array, when_gene: Array) -> tuple[Array, Array, Array]:
         """Return trigger, threshold and first step (B,) each, of two genes (B,)."""
-        trigger = np.array([TRIGGERS.index(name) for name in self.triggers])[pick(trigger_gene, len(self.triggers))]
+        trigger = np.array([TRIGGERS.index(name) for name in self.triggers])[_pick(trigger_gene, len(self.triggers))]
         threshold, threat = np.zeros(len(trigger)), self.brief.threat
         for name, (low, high) in self.road.items():
             here = trigger == TRIGGERS.index(name)
             threshold[here] = _short(low + (high - low) * when_gene[here])
         last = self.brief.horizon if threat.end is None else min(threat.end, self.brief.horizon)
-        first = threat.onset + pick(when_gene, max(last - threat.onset + 1, 1))
+        first = threat.onset + _pick(when_gene, max(last - threat.onset + 1, 1))
         return trigger, threshold, np.where(trigger == 0, first, 1)
 
     @property
@@ -244,9 +245,10 @@ class Space:
         gene["family"][:] = ((np.arange(len(self.families)) + 0.5) / max(len(self.families), 1))[:, None, None]
         gene["sign"][:] = np.array(signs)[:, None]
         gene["pause"][:] = pauses
+        gene["rate_sign"][:] = np.array(signs)[:, None]
         for name in ("size", "rate", "hop"):
             gene[name][:] = np.nextafter(1.0, 0.0)
-        distinct = np.array([[True, bool(one.value) or one.ramp] for one in self.families], bool).reshape(-1, len(signs))
+        distinct = np.array([[True, one.kind in SIGNED] for one in self.families], bool).reshape(-1, len(signs))
         return np.minimum(out[distinct & (self.budget > 1)].reshape(-1, self.genes), np.nextafter(1.0, 0.0))
 
     def scripts(self, genomes: Array) -> Sequence:
@@ -259,12 +261,12 @@ class Space:
 
     def family(self, genome: Array) -> Family:
         """Return the family of one script."""
-        return self.families[int(pick(genome[:1], len(self.families))[0])]
+        return self.families[int(_pick(genome[:1], len(self.families))[0])]
 
     def sets(self, genome: Array) -> tuple[tuple[str, ...], int | None]:
         """Return the wires that one script names, and its agent; empty and None: all that are granted."""
         gene = dict(zip(GENES, genome[:, None], strict=True))
-        return self.wires[int(pick(gene["targets"], len(self.wires))[0])], self.agents[int(pick(gene["agent"], len(self.agents))[0])]
+        return self.wires[int(_pick(gene["targets"], len(self.wires))[0])], self.agents[int(_pick(gene["agent"], len(self.agents))[0])]
 
     def text(self, genome: Array, folder: Path | None = None) -> str:
         """Return the text of one script, as on the command line."""

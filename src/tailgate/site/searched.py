@@ -23,7 +23,7 @@ def members_of(suite: Suite) -> Data | None:
     rows = [row | {"mean": _points(row["damage"]), "points": _points(row["adds"])} for row in searched.worth(lines)]
     return {
         "rows": rows, "cells": len(cells), "defences": len(lines), "attacks": len(found_for(suite)), "beaten": beaten,
-        "ensemble": lines[0]["ensemble"], "budget": lines[0]["budget"],
+        "ensemble": ", ".join(sorted({line["ensemble"] for line in lines})), "budget": lines[0]["budget"],
     }  # fmt: skip
 
 
