@@ -129,7 +129,7 @@ def test_a_row_plays_what_the_text_of_its_feedback_says(name):
 
 
 def test_single_steps_with_every_pause_begin_the_search_of_scripts():
-    """Of every family, of both signs where it has a value; one pause alone defeats a defence that trusts again after 20 steps."""
+    """Every family, with both signs where values have one. A single pause defeats a defence that trusts again after 20 steps."""
     suite = load_suite("quick-v1")
     place = Arena(suite.name, "gusty-stop-and-go-v0", 12, "safe_state_brake", dict(suite.granted), suite.bound, suite.progress)
     texts = [place.space.text(genome) for genome in place.space.rhythms]
@@ -179,8 +179,10 @@ def _granted(place):
 def test_the_plain_loop_plays_the_same():
     place = arena("radar")
     scripts = place.space.scripts(np.random.default_rng(1).random((40, len(GENES))))
-    fast, plain = played(place, scripts), played(place, scripts, plainly=True)
-    assert all(np.array_equal(a, b) for a, b in zip(fast, plain, strict=True)) and plain.ended.any()
+    feedbacks = place.feedbacks.numbers([place.feedbacks.drawn(np.random.default_rng(seed)) for seed in range(24)])
+    for attacks in (scripts, feedbacks):
+        fast, plain = played(place, attacks), played(place, attacks, plainly=True)
+        assert all(np.array_equal(a, b) for a, b in zip(fast, plain, strict=True)) and plain.ended.any()
 
 
 @pytest.mark.long

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from tailgate.core import Array, Kind
+from tailgate.ensemble.evolution import SHORTER
 from tailgate.ensemble.feedbacks import Choice, Feedbacks, Point
 from tailgate.ensemble.search import FINALISTS, PROMISING, Arena, Tell
 
@@ -19,7 +20,7 @@ SCREENS = 4, 16  # episodes of every random attack, and of the best ones
 EPISODES, AGAIN = 32, 256  # of an attack, and of one that is compared in the end
 GROUP, STEP = 16, 0.4  # attacks of a run in a round, and their first spread
 BEST, ENDS = 64, 48  # random attacks among which runs begin, and attacks that are compared in the end
-LEAST, SHORTER = 2, 4  # runs at least; the part of a search that is played in the plain loop
+LEAST = 2  # runs, at least
 
 
 class Stage(NamedTuple):
@@ -38,13 +39,13 @@ class Climb:
 
     def sized(self, agents: int, traced: bool = True) -> Climb:
         """Return the search for a system of this size."""
-        part = agents * (1 if traced else SHORTER)
-        stages = (Stage(max(runs // agents, LEAST), max(rounds // (1 if traced else SHORTER), 1)) for runs, rounds in self.stages)
-        return Climb(max(self.random // part, BEST), tuple(stages))
+        part = 1 if traced else SHORTER
+        stages = (Stage(max(runs // agents, LEAST), max(rounds // part, 1)) for runs, rounds in self.stages)
+        return Climb(max(self.random // (agents * part), BEST), tuple(stages))
 
     @property
     def screened(self) -> tuple[int, ...]:
-        """How many random attacks are left after each screen."""
+        """The random attacks that each screen leaves."""
         return tuple(max(self.random // PROMISING**i, BEST) for i in range(1, len(SCREENS) + 1))
 
     @property

@@ -85,7 +85,7 @@ class Choice(NamedTuple):
     later: Kind
     wires: int  # place in `Space.wires`
     agent: int | None  # None: all that are granted
-    trigger: int  # place in TRIGGERS
+    trigger: int  # place in `Space.triggers`
     bursts: bool
 
 
@@ -121,11 +121,11 @@ class Feedbacks:
 
     def drawn(self, rng: np.random.Generator) -> Point:
         """Return an attack at random."""
-        space, names = self.space, self.space.triggers
+        space = self.space
         kind, later = (self.kinds[int(rng.integers(len(self.kinds)))] for _ in range(2))
         choice = Choice(
             kind, later if rng.random() < CHANGES else kind, int(rng.integers(len(space.wires))),
-            space.agents[int(rng.integers(len(space.agents)))], TRIGGERS.index(names[int(rng.integers(len(names)))]),
+            space.agents[int(rng.integers(len(space.agents)))], int(rng.integers(len(space.triggers))),
             bool(rng.random() < REPEATS and space.budget > 1),
         )  # fmt: skip
         weights, shares = rng.standard_normal((len(self.wires), FEATURES)) * SIZES, rng.uniform(0.0, 1.0, TIMES)
@@ -134,7 +134,7 @@ class Feedbacks:
             kind = valued[int(rng.integers(len(valued)))]
             choice = choice._replace(kind=kind, later=kind, wires=choice.wires if rng.random() < SPARING else 0, bursts=True)
             most = min(np.arcsinh(space.reach(kind)[1] / UNIT), STEEPEST)
-            weights = np.zeros(weights.shape) + rng.uniform(-most, most, len(weights))[:, None] * np.eye(FEATURES)[0]
+            weights = rng.uniform(-most, most, len(weights))[:, None] * np.eye(FEATURES)[0]
             shares[1:3] = 0.0, np.log(rng.integers(1, LONG + 1)) / np.log(LONG)
         shares = np.clip(shares, INNER, 1.0 - INNER)
         return Point(choice, np.concatenate([weights.ravel(), np.log(shares / (1.0 - shares)) / STEEP]))
@@ -155,13 +155,13 @@ class Feedbacks:
             target = target & receivers(brief) if (target & receivers(brief)).any() else receivers(brief)
         if choice.agent is not None:
             target = target & (np.arange(len(target)) == choice.agent)[:, None]
-        place = (space.triggers.index(TRIGGERS[choice.trigger]) + 0.5) / len(space.triggers)
-        _, threshold, start = (part[0] for part in space.opening(np.array([place]), np.array([when])))
+        genes = np.array([(choice.trigger + 0.5) / len(space.triggers)]), np.array([when])
+        trigger, threshold, start = (part[0] for part in space.opening(*genes))
         steps = (
-            choice.kind, choice.later, max(1, int(budget * switch)) if choice.later != choice.kind else NEVER, choice.trigger, start,
+            choice.kind, choice.later, max(1, int(budget * switch)) if choice.later != choice.kind else NEVER, start,
             max(1, round((budget / 2.0) ** burst)) if choice.bursts else NEVER, max(1, round(LONG**pause)) if choice.bursts else 0,
         )  # fmt: skip
-        kind, later, change, trigger, first, length, rest = (np.array(number, np.int64) for number in steps)
+        kind, later, change, first, length, rest = (np.array(number, np.int64) for number in steps)
         everywhere = np.broadcast_to(weights, (*target.shape, FEATURES))
         return Numbers(everywhere, target, kind, later, change, trigger, threshold, first, length, rest)
 
@@ -176,8 +176,8 @@ class Feedbacks:
             parts.append(f"targets=[{','.join(name for name, on in zip(self.wires, hit, strict=True) if on)}]")
         if choice.agent is not None:
             parts.append(f"agents=[{choice.agent}]")
-        opening = f"trigger={TRIGGERS[choice.trigger]},threshold={one.threshold!s}" if choice.trigger else f"start_step={one.start}"
-        parts.append(opening)
+        name = TRIGGERS[int(one.trigger)]
+        parts.append(f"start_step={one.start}" if name == "time" else f"trigger={name},threshold={one.threshold!s}")
         if choice.bursts:
             parts.append(f"burst={one.burst},pause={one.pause}")
         if EFFECTS[choice.kind].valued or EFFECTS[choice.later].valued:
