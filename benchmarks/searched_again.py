@@ -2,10 +2,9 @@
 
     python benchmarks/searched_again.py radar-v1 [--budget quick] [--seed 0] [--workers 2] [--json FILE]
 
-Each ranked figure at black box that leaves more than 10 % undamaged is searched: `scripts` in every scenario, `feedback` in that of
-its worst attack, or in every one if nothing does harm yet. There all attacks are played as well that the board's searches found against
-other defences at the same dose. The best attack of each search then meets 2000 fresh episodes. The same seed finds the same attacks.
-Run it from the folder of the repository, where the files of attacks are.
+Each ranked figure at black box that leaves more than 10 % undamaged is searched: by `scripts` and `transfer` in every scenario, by
+`feedback` in that of its worst attack, or in every one if nothing does harm yet. The best attack of each search then meets 2000 fresh
+episodes. The same seed finds the same attacks.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import lzma
+import re
 import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,24 +34,13 @@ class Figure(NamedTuple):
     scenario: str  # of its worst attack
     attack: str
     published: float  # share of damaged episodes
-    others: dict[str, tuple[str, ...]]  # attacks that were found against other defences at this dose, by scenario
 
 
 def figures(name: str, board: dict[str, Any]) -> list[Figure]:
     """Return the figures of a board that can fall."""
-    def others(defence: str, dose: int) -> dict[str, tuple[str, ...]]:
-        found: dict[str, dict[str, None]] = {}
-        for cell in (cell for line in board["searches"] if line["defence"] != defence for cell in line["cells"] if cell["dose"] == dose):
-            members = [one for one in cell["members"] if one["knowledge"] == "black" or one["member"] == "gradient"]
-            found.setdefault(cell["scenario"], {}).update({one["attack"]: None for one in members if one["attack"]})
-        return {scenario: tuple(attacks) for scenario, attacks in found.items()}
-
     return [
-        Figure(
-            name, entry["defence"], rate["dose"], worst["scenario"], worst["attack"], 1.0 - rate["undamaged"]["value"],
-            others(entry["defence"], rate["dose"]),
-        ) for entry in board["entries"] if entry["rank"] is not None for rate in entry["rates"]
-        for worst in [rate["worst"]] if rate["knowledge"] == "black" and rate["undamaged"] and rate["undamaged"]["value"] > 0.1
+        Figure(name, entry["defence"], rate["dose"], worst["scenario"], worst["attack"], 1.0 - rate["undamaged"]["value"])
+        for entry in board["entries"] if entry["rank"] is not None for rate in entry["rates"] for worst in [rate["worst"]] if rate["knowledge"] == "black" and rate["undamaged"] and rate["undamaged"]["value"] > 0.1
     ]  # fmt: skip
 
 
@@ -62,13 +51,14 @@ def searched(figure: Figure, budget: str, seed: int) -> dict[str, Any]:
         for place in suite.scenarios:
             arena = Arena(suite.name, place, figure.dose, figure.defence, dict(suite.granted), suite.bound, suite.progress)
             here = place == figure.scenario or not figure.published
-            only = ("scripts", "feedback") if here else ("scripts",)
+            only = ("scripts", "feedback", "transfer") if here else ("scripts", "transfer")
             best = [one.found[0].attack for one in harvest(Hunt(arena, BUDGETS[budget], seed, Path(folder), only=only)) if one.found]
-            best += arena.promising(figure.others.get(place, ()), 1) if here else []
             found += [(arena.confirmed(attack, "report", FIRST_FRESH, FRESH)[0], place, attack) for attack in best]
     damage, place, attack = max(found, key=lambda one: one[0])
-    row = figure._asdict() | {"published_attack": figure.attack, "found": damage, "found_in": place, "attack": attack}
-    return {name: row[name] for name in row if name != "others"} | {"budget": budget, "seed": seed}
+    attack = re.sub(r"path=\S*/", "path=", attack)
+    return figure._asdict() | {
+        "published_attack": figure.attack, "found": damage, "found_in": place, "attack": attack, "budget": budget, "seed": seed,
+    }  # fmt: skip
 
 
 def main() -> None:

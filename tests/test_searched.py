@@ -143,8 +143,10 @@ def test_a_rank_asks_for_the_searches(made: tuple[Path, Path]) -> None:
     assert why([line | {"cells": idle}]).endswith("not whole: no attack of a black box")
     fewer = [cell | {"members": [one for one in cell["members"] if one["member"] != "feedback"]} for cell in line["cells"]]
     assert why([line | {"cells": fewer}]) == "the search on braking at dose 4 is not whole: no member feedback"
-    older = score(rows, suite, searches=[line | {"cells": fewer, "ensemble": "standard-v1"}])["entries"]
-    assert next(e["rank"] for e in older if e["defence"] == "chi2_kf") is not None
+    for name, cells in (("standard-v1", fewer), ("standard-v2", line["cells"])):
+        older = score(rows, suite, searches=[line | {"cells": cells, "ensemble": name}])["entries"]
+        assert next(e["rank"] for e in older if e["defence"] == "chi2_kf") is not None
+    assert why([line | {"cells": fewer, "ensemble": "standard-v2"}]) == "the search on braking at dose 4 is not whole: no member feedback"
     assert why([line | {"ensemble": "standard-v0"}]) == f"the ensemble attacked another ensemble: standard-v0, not {standard.NAME}"
     left = [cell | {"members": [one | {"damage": None, "attack": None, "why": standard.ELSEWHERE} for one in cell["members"]]} for cell in line["cells"]]
     assert why([line | {"cells": left}]).endswith("not whole: scripts did not search")

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 SPREAD = 0.3  # of the first generation: of the size of a network's weights, and by itself where they are 0
 JUDGED = 1024  # episodes that decide which starts go on, for a system of one agent
 FIRST = 1 << 30  # number of the first episode that starts are judged on: no search meets it before
-ZOO = "zoo "  # how the names of published policies begin
+ZOO = "published "  # how the names of published policies begin
 SHORTER = 4  # a race in the plain loop has this part of its generations and judging episodes
 
 

@@ -18,6 +18,7 @@ from tailgate.engine.untraceable import Untraceable
 from tailgate.ensemble.climb import Climb, Stage, climbed
 from tailgate.ensemble.gradient import Pace, gradient
 from tailgate.ensemble.networks import FORMS, PUBLISHED, Phase, Race, is_ramp, learned, transferred
+from tailgate.ensemble.published import found_against_others
 from tailgate.ensemble.search import FINALISTS, Arena, Effort, Found, Meaningless, Tell, search
 
 ALIKE = 2  # finalists of a family: others may come from behind
@@ -116,17 +117,20 @@ def _feedback(hunt: Hunt) -> list[str]:
 
 def _policies(hunt: Hunt, knowledge: str) -> list[str]:
     """Learn networks; those that know more than the road begin as the best of the others did."""
-    found = learned(hunt.arena, knowledge, hunt.best_scripts, hunt.budget.race, hunt.seed, hunt.folder, hunt.tell, hunt.starts[:GREY])
+    found = learned(
+        hunt.arena, knowledge, hunt.best_scripts, hunt.budget.race, hunt.seed, hunt.folder, hunt.tell, hunt.starts[:GREY],
+        [one.attack for one in hunt.found.get("transfer", [])],
+    )  # fmt: skip
     hunt.starts = hunt.starts or found.starts
     return found.attacks
 
 
 def _transfer(hunt: Hunt) -> list[str]:
-    """Play the published policies that have a meaning here."""
-    found = transferred(hunt.arena)
+    """Play the policies of the zoo that have a meaning here, and what a published board found here against other defences."""
+    found = transferred(hunt.arena) + found_against_others(hunt.arena, hunt.folder / "published")
     if not found:
         raise Meaningless("zoo", f"{len(zoo_names())} policies", "one with the observations and the actions of this threat model")
-    return hunt.arena.promising(f"zoo:name={policy.name}" for policy, _ in found)
+    return hunt.arena.promising(found)
 
 
 def _white_box(hunt: Hunt) -> list[str]:

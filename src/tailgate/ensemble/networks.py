@@ -13,13 +13,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from tailgate.agents.learners.cem import Shape, imitation, lean, scales
 from tailgate.agents.learners.teacher import Demonstration, demonstrate
-from tailgate.agents.policy.network_policy import PolicyPlan
+from tailgate.agents.policy.network_policy import PolicyAttack, PolicyPlan
 from tailgate.agents.policy.zoo import ZooAttack, zoo_names
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core.kinds import Kind
@@ -41,7 +41,7 @@ SHOWN = 128  # episodes of the script that a network imitates, for a system of o
 RAMP = (1, 3, 9)  # steps of a ramp whose sizes a policy may send
 COPIED = 1024  # decisions of a script in a step of its imitation
 LEAST, FEWEST = 16, 8  # policies of a generation, and episodes that each plays, at least
-PUBLISHED = 2  # policies of the zoo that join, at most
+PUBLISHED = 2  # published policies that join, at most
 SLOWEST = 1e-3  # of the bound: the slowest ramp
 
 
@@ -182,11 +182,13 @@ def _small(forms: Sequence[Form], codec: ActionCodec, deep: ObservationCodec) ->
     return [form._replace(frames=frames) for form in forms if (frames := min(form.frames, LARGE // (each * (form.hidden or codec.size))))]
 
 
-def starts_of(arena: Arena, knowledge: str, scripts: Sequence[str], seed: int, only: Sequence[str] = ()) -> list[Start]:
+def starts_of(
+    arena: Arena, knowledge: str, scripts: Sequence[str], seed: int, only: Sequence[str] = (), published: Sequence[str] = (),
+) -> list[Start]:  # fmt: skip
     """Return the starts of a race: rest and an imitation of each script in every form, and published policies that fit.
 
     Policies that move a value step by step begin from the first script of one size, and from the first ramp.
-    only: names of those that are made, next to the published ones; empty: all.
+    only: names of those that are made, next to the published ones; empty: all. published: policies that come before those of the zoo.
     Raises Meaningless where the threat model grants nothing that a policy could choose.
     """
     loop, out = arena.seat(knowledge), []
@@ -201,11 +203,21 @@ def starts_of(arena: Arena, knowledge: str, scripts: Sequence[str], seed: int, o
     for growing in (False, True):
         for script, raised in [one for one in moved if is_ramp(one[0]) == growing][:1]:
             out += _drawn(loop, raised, [RAMPING], [script], seed, only)
-    fit = [
-        Start(ZOO + policy.name, held, np.ones(len(held.observation.names))) for policy, held in transferred(arena)
-        if policy.knowledge == knowledge and held.network.lstm is None and held.action.discrete
-    ]  # fmt: skip
-    return [*out, *fit[:PUBLISHED]]
+    return [*out, *_published(arena, knowledge, published)[:PUBLISHED]]
+
+
+def _published(arena: Arena, knowledge: str, texts: Sequence[str]) -> list[Start]:
+    """Return published policies, then those of the zoo, that a race of this knowledge can change."""
+    out: dict[str, Start] = {}
+    for text in (*texts, *transferred(arena)):
+        attack = Spec("attack", text).make()
+        if not isinstance(attack, ZooAttack | PolicyAttack) or attack.knowledge != knowledge:
+            continue
+        plan = attack.prepare(arena.seat(knowledge, attack).brief)
+        if plan.network.lstm is None and plan.action.discrete:
+            name = attack.name if isinstance(attack, ZooAttack) else attack.path.stem
+            out.setdefault(name, Start(ZOO + name, plan, np.ones(len(plan.observation.names))))
+    return list(out.values())
 
 
 class Learned(NamedTuple):
@@ -217,7 +229,7 @@ class Learned(NamedTuple):
 
 def learned(
     arena: Arena, knowledge: str, scripts: Sequence[str], race: Race, seed: int, folder: Path, tell: Tell | None = None,
-    only: Sequence[str] = (),
+    only: Sequence[str] = (), published: Sequence[str] = (),
 ) -> Learned:  # fmt: skip
     """Learn policies against an arena's defence; return the two that did most harm.
 
@@ -231,13 +243,16 @@ def learned(
         The policies' files are written below it.
     only
         Names of the starts that take part, and published policies; empty: all.
+    published
+        Policies that take part before those of the zoo, as on the command line.
 
     Raises
     ------
     NotApplicable
         Where there is nothing to choose.
     """
-    runs = _without_copies([Evolution(arena, knowledge, start) for start in starts_of(arena, knowledge, scripts, seed, only)])
+    starts = starts_of(arena, knowledge, scripts, seed, only, published)
+    runs = _without_copies([Evolution(arena, knowledge, start) for start in starts])
     race = race if all(run.traced for run in runs) else race.shorter()
     for run in runs:
         run.enter(race.members(arena.loop.model.agents), seed)
@@ -263,13 +278,14 @@ def _without_copies(runs: list[Evolution]) -> list[Evolution]:
     return [run for run in runs if not run.start.script or best[run.start.script] is run]
 
 
-def transferred(arena: Arena) -> list[tuple[ZooAttack, PolicyPlan]]:
-    """Return the published policies that have a meaning in an arena, those for its defence first."""
-    out: list[tuple[ZooAttack, Any]] = []
+def transferred(arena: Arena) -> list[str]:
+    """Return the policies of the zoo that have a meaning in an arena, those for its defence first."""
+    out = []
     for name in zoo_names():
         policy = ZooAttack(name)
         try:
-            out.append((policy, policy.prepare(arena.seat(policy.knowledge, policy).brief)))
+            policy.prepare(arena.seat(policy.knowledge, policy).brief)
         except (NotApplicable, InputError):
             continue
-    return sorted(out, key=lambda one: f"-{arena.defence}-" not in one[0].name)
+        out.append(f"zoo:name={name}")
+    return sorted(out, key=lambda one: f"-{arena.defence}-" not in one)
