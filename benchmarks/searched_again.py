@@ -40,7 +40,8 @@ def figures(name: str, board: dict[str, Any]) -> list[Figure]:
     """Return the figures of a board that can fall."""
     return [
         Figure(name, entry["defence"], rate["dose"], worst["scenario"], worst["attack"], 1.0 - rate["undamaged"]["value"])
-        for entry in board["entries"] if entry["rank"] is not None for rate in entry["rates"] for worst in [rate["worst"]] if rate["knowledge"] == "black" and rate["undamaged"] and rate["undamaged"]["value"] > 0.1
+        for entry in board["entries"] if entry["rank"] is not None for rate in entry["rates"] for worst in [rate["worst"]]
+        if rate["knowledge"] == "black" and rate["undamaged"] and rate["undamaged"]["value"] > 0.1
     ]  # fmt: skip
 
 
