@@ -1,7 +1,7 @@
 # ruff: noqa: E501 - tables
 """Real roads: the fit, false alarms on recordings, the time gap, and the order of defences on made-up and recorded roads and by time gap.
 
-    python benchmarks/roads.py [--out results/roads-v0] [--parts fit,alarms,order,headway,boards,gaps,aeb,speed] [--episodes 100]
+    python benchmarks/roads.py [--out results/roads-v0] [--parts fit,alarms,order,headway,boards,gaps,aeb,noise,speed] [--episodes 100]
 
 Each part writes PART.json into the folder, and a figure into docs/images with --figures. A part that has its file is not played again.
 """
@@ -37,6 +37,7 @@ from tailgate.roads.replayed import Noise, cut, loop_over, rows
 ROOT = Path(__file__).parents[1]
 DEFENCES = ("none", "kf", "rkf", "imm", "chi2_kf", "chi2_kf_sparse", "windowed_chi2_kf", "cusum_kf", "mewma_kf", "reacquire_kf",
             "cusum_reacquire_kf", "widen_kf", "brake_kf")  # fmt: skip
+NOISY = {"range_sd": 0.38, "speed_sd": 0.14}  # 1.5 % of 25 m, and the largest published figure of range rate at 77 GHz [m, m/s]
 DETECTORS = ("chi2_kf", "chi2_kf_sparse", "windowed_chi2_kf", "cusum_kf", "mewma_kf", "rkf", "imm")
 RECORDINGS = (("asta-string", "asta-braking"), ("comma2k19-radar",))  # of one rate each
 RESAMPLES, GAPS = 2000, (1.2, 3.0)  # time gaps [s] of the comparison with all else equal
@@ -259,6 +260,25 @@ def part_aeb(options: argparse.Namespace) -> dict[str, Any]:
     return out
 
 
+def part_noise(options: argparse.Namespace) -> dict[str, Any]:
+    """Collisions with a noisier radar, under the worst attack without knowledge that the board's searches found with the usual one."""
+    suite, out = load_suite("road-v0"), {}
+    usual = load_scenario("road-following-v0")
+    noisy = dataclasses.replace(usual, sensor=dataclasses.replace(usual.sensor, **NOISY))
+    for line in load(ROOT / "results" / "road-v0" / "board.json.xz")["searches"]:
+        (cell,) = [cell for cell in line["cells"] if (cell["scenario"], cell["dose"]) == (usual.name, 40)]
+        found = [one["attack"] for one in cell["members"] if one["attack"] and (one["knowledge"] == "black" or one["member"] == "gradient")]
+        guard, share = Spec("defence", line["defence"]), {}
+        for name, place in (("usual", usual), ("noisy", noisy)):
+            loop = place.with_threat(**(suite.granted | {"budget": 40})).loop(guard.make(), guard.entry.uses)
+            share[name] = max(
+                float(METRICS["collided"](rollout(loop, Spec("attack", text).make(), draws.keys("report", range(options.episodes)))).mean())
+                for text in found
+            )  # fmt: skip
+        out[line["defence"]] = share
+    return {"noisy": NOISY, "collisions": out}
+
+
 def part_speed(options: argparse.Namespace) -> dict[str, Any]:
     """Million steps/s of random actions through the environment, 4096 episodes, one core; the median of three."""
     import gymnasium
@@ -279,7 +299,7 @@ def part_speed(options: argparse.Namespace) -> dict[str, Any]:
     return out
 
 
-PARTS = {"fit": part_fit, "alarms": part_alarms, "order": part_order, "headway": part_headway, "boards": part_boards, "gaps": part_gaps, "aeb": part_aeb, "speed": part_speed}
+PARTS = {"fit": part_fit, "alarms": part_alarms, "order": part_order, "headway": part_headway, "boards": part_boards, "gaps": part_gaps, "aeb": part_aeb, "noise": part_noise, "speed": part_speed}
 
 
 def draw_order(held: dict[str, Any]) -> bytes:
