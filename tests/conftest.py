@@ -297,7 +297,7 @@ def shrink_ensemble(monkeypatch):
     monkeypatch.setattr(networks, "zoo_names", lambda: few)
 
     effort = searching.Effort(64, 3)
-    budget = members.Budget(effort, effort, members.Climb(64, (members.Stage(2, 2),)), 6, ((2, 8), (1, 8)), members.Pace(16, 1, 1, 8))
+    budget = members.Budget(effort, effort, members.Climb(64, (members.Stage(2, 2),)), members.Climb(64, (members.Stage(2, 2),)), 6, ((2, 8), (1, 8)), members.Pace(16, 1, 1, 8))
     monkeypatch.setitem(members.BUDGETS, "quick", budget)
     monkeypatch.setattr(evolution, "JUDGED", 64)
     for name, value in (("SHOWN", 8), ("COPIED", 64)):

@@ -37,10 +37,10 @@ def only(monkeypatch, *names):
         monkeypatch.setattr(module, "MEMBERS", [one for one in members.MEMBERS if one.name in names])
 
 
-@pytest.mark.parametrize("left_out", [("feedback", "transfer", "grey networks", "white box"), pytest.param((), marks=pytest.mark.long)])
+@pytest.mark.parametrize("left_out", [("feedback", "segments", "transfer", "grey networks", "white box"), pytest.param((), marks=pytest.mark.long)])
 def test_the_command(left_out, small_ensemble, tmp_path, capsys, monkeypatch):
     """It compares with the suite's attacks, writes scripts that `evaluate` plays, and goes on where it was ended."""
-    kinds = {"scripts": "black", "programs": "black", "feedback": "black", "transfer": "black", "networks": "black", "grey networks": "grey", "white box": "white", "gradient": "white"}
+    kinds = {"scripts": "black", "programs": "black", "feedback": "black", "segments": "black", "transfer": "black", "networks": "black", "grey networks": "grey", "white box": "white", "gradient": "white"}
     kinds = {name: kind for name, kind in kinds.items() if name not in left_out}
     only(monkeypatch, *kinds)
     assert main([*WORDS, "--out", str(tmp_path), "--json"]) == 0
@@ -223,7 +223,7 @@ def test_a_threat_model_that_grants_nothing(small_ensemble, capsys, tmp_path):
     assert main(words) == 0
     (cell,) = json.loads(capsys.readouterr().out)["cells"]
     own = {one["member"]: one for one in cell["members"]}
-    assert all(own[name]["attack"] is None and own[name]["why"] for name in ("scripts", "programs", "feedback", "networks", "gradient"))
+    assert all(own[name]["attack"] is None and own[name]["why"] for name in ("scripts", "programs", "feedback", "segments", "networks", "gradient"))
 
 
 @pytest.mark.parametrize("name", ["a,b", "c[1]", "d:e"])

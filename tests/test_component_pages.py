@@ -39,7 +39,7 @@ def play(lines: str) -> int:
 
 @pytest.mark.parametrize(
     ("family", "name"),
-    [("attack", "insider"), ("attack", "zero_dynamics"), ("attack", "feedback"), ("attack", "optimal_stealth"), ("mitigation", "sliding_mode"), ("filter", "joint_rls")],
+    [("attack", "insider"), ("attack", "zero_dynamics"), ("attack", "feedback"), ("attack", "segments"), ("attack", "optimal_stealth"), ("mitigation", "sliding_mode"), ("filter", "joint_rls")],
 )
 def test_a_component_is_shown_where_it_has_a_meaning(family: Family, name: str) -> None:
     from tailgate_docs.usage import usage  # type: ignore[import-not-found]

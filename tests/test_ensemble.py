@@ -116,16 +116,18 @@ def test_a_row_plays_what_the_file_of_its_program_says(name, tmp_path):
 
 @pytest.mark.thin(2)
 @pytest.mark.parametrize("name", ["car", "radar", "platoon"])
-def test_a_row_plays_what_the_text_of_its_feedback_says(name):
+@pytest.mark.parametrize("form", ["feedbacks", "segments"])
+def test_a_row_plays_what_the_text_of_its_point_says(name, form):
     """With every kind, trigger and set of wires."""
     place, rng, attacked = arena(name), np.random.default_rng(9), 0
-    points = [place.feedbacks.drawn(rng) for _ in range(24)]
-    outcome = played(place, place.feedbacks.numbers(points))
-    for i, text in enumerate(map(place.feedbacks.text, points)):
+    space = getattr(place, form)
+    points = [space.drawn(rng) for _ in range(24)]
+    outcome = played(place, space.numbers(points))
+    for i, text in enumerate(map(space.text, points)):
         wanted, on = as_evaluated(place, text)
         assert_same(place, Played(*(part[i * EPISODES : (i + 1) * EPISODES] for part in outcome)), wanted, text)
         attacked += on
-    assert attacked > 4 and {point.choice.kind for point in points} == set(place.feedbacks.kinds)
+    assert attacked > 4 and {point.choice.kind for point in points} == set(space.kinds)
 
 
 def test_single_steps_with_every_pause_begin_the_search_of_scripts():
@@ -144,15 +146,36 @@ def test_single_steps_with_every_pause_begin_the_search_of_scripts():
     assert len(dataclasses.replace(place, dose=1).space.rhythms) == 0
 
 
-def test_a_climb_finds_more_than_the_random_attacks_that_it_begins_with():
+@pytest.mark.parametrize("form", ["feedbacks", "segments"])
+def test_a_climb_finds_more_than_the_random_attacks_that_it_begins_with(form):
     """The same attacks each time, the most harmful first; where nobody drives, none."""
     suite, effort = load_suite("radar-v1"), Climb(256, (Stage(4, 12),))
     place = Arena(suite.name, "radar-braking-v0", 4, "cusum_kf", dict(suite.granted), suite.bound, suite.progress)
     told = []
-    found = climbed(place, effort, 0, lambda *one: told.append(one))
-    assert found == climbed(place, effort) != climbed(place, effort, 1)
+    space = getattr(place, form)
+    found = climbed(place, space, effort, 0, lambda *one: told.append(one))
+    assert found == climbed(place, space, effort) != climbed(place, space, effort, 1)
     assert [one[:2] for one in told] == [(i, 12) for i in range(1, 13)] and told[-1][3] > told[0][3] + 0.25  # 0.09 by chance alone
-    assert climbed(arena("network"), effort) == []
+    assert climbed(arena("network"), getattr(arena("network"), form), effort) == []
+
+
+def test_ghosts_play_what_their_text_says_to_the_last_digits():
+    """Each ends before a reading leaves the bounds; where cars drive there are none."""
+    place, rng = arena("network"), np.random.default_rng(3)
+    space = place.ghosts
+    points = [space.drawn(rng) for _ in range(12)]
+    outcome, moved = played(place, space.numbers(points)), 0
+    for i, text in enumerate(map(space.text, points)):
+        try:
+            wanted, _ = as_evaluated(place, text)
+        except NotApplicable as error:
+            assert error.field == "attack ghost.size" and space.numbers(points).last[i] == 0
+            continue
+        mine = outcome.error[i * EPISODES : (i + 1) * EPISODES]
+        assert np.allclose(mine, wanted.error, rtol=1e-9), text
+        moved += bool((mine > 2.0 * np.median(outcome.error)).any())
+    assert moved and {point.choice.grows for point in points} == {True, False}
+    assert not arena("car").ghosts.kinds
 
 
 def test_programs_around_scripts_hold_them():
@@ -179,8 +202,9 @@ def _granted(place):
 def test_the_plain_loop_plays_the_same():
     place = arena("radar")
     scripts = place.space.scripts(np.random.default_rng(1).random((40, len(GENES))))
-    feedbacks = place.feedbacks.numbers([place.feedbacks.drawn(np.random.default_rng(seed)) for seed in range(24)])
-    for attacks in (scripts, feedbacks):
+    forms = (place.feedbacks, place.segments)
+    points = [space.numbers([space.drawn(np.random.default_rng(seed)) for seed in range(24)]) for space in forms]
+    for attacks in (scripts, *points):
         fast, plain = played(place, attacks), played(place, attacks, plainly=True)
         assert all(np.array_equal(a, b) for a, b in zip(fast, plain, strict=True)) and plain.ended.any()
 

@@ -74,7 +74,7 @@ def test_a_damaged_journal_begins_again(job: standard.Job, damage: str, tmp_path
         standard.search(job, tmp_path)
     (path,) = tmp_path.glob("searches/*.journal")
     held = json.loads(path.read_text())
-    assert [one["member"] for one in held["members"]] == ["scripts", "programs", "feedback"]
+    assert [one["member"] for one in held["members"]] == ["scripts", "programs", "feedback", "segments", "ghosts"]
     key, _, value = damage.partition(": ")
     one = held["members"][0]
     if key in one["found"][0]:
@@ -87,7 +87,7 @@ def test_a_damaged_journal_begins_again(job: standard.Job, damage: str, tmp_path
     began = _counted(monkeypatch, "transfer")
     with pytest.raises(KeyboardInterrupt):
         standard.search(job, tmp_path)
-    assert began == ["scripts", "programs", "feedback", "transfer"]
+    assert began == ["scripts", "programs", "feedback", "segments", "ghosts", "transfer"]
     for file in tmp_path.glob("attacks/**/*.yaml"):
         file.unlink()
     again = _counted(monkeypatch, "transfer")

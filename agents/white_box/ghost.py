@@ -18,6 +18,12 @@ from tailgate.core.registry import register
 from tailgate.core.threat import Brief
 
 
+def within(brief: Brief, values: Array) -> int:
+    """Return the steps of readings (K, N, w) before one leaves the bounds."""
+    beyond = (np.abs(values) > brief.bounds).any(axis=(1, 2))
+    return int(np.argmax(beyond)) if beyond.any() else len(values)
+
+
 class Ghost(NamedTuple):
     """The values added to the readings, by the step of the window; the last one that the bounds admit is the end."""
 
@@ -39,25 +45,26 @@ class GhostState(Script):
     settle: Settling = param(400, "steps of A that leave only these modes of a random direction")
 
     def prepare(self, brief: Brief) -> ScriptPlan:
-        plan, model, where = super().prepare(brief), brief.model, "attack ghost"
-        sensors = len(model.sensors)
-        target = plan.target & (np.arange(len(model.wires)) < sensors)
+        target, values = self.readings(brief)
+        last = within(brief, values)
+        if last == 0:
+            raise NotApplicable("attack ghost.size", self.size, "a ghost whose readings stay within the bounds of the threat model")
+        return ScriptPlan(brief, target, Ghost(values[:last]))
+
+    def readings(self, brief: Brief) -> tuple[Array, Array]:
+        """Return the sensors (N, w) bool that are attacked, and their readings (K, N, w) in a horizon."""
+        model, where = brief.model, "attack ghost"
+        target = super().prepare(brief).target & (np.arange(len(model.wires)) < len(model.sensors))
         if not target.any():
             raise NotApplicable(f"{where}: targets", list(brief.threat.targets), "a threat model that grants sensors")
         require(brief, where, ["fdi"], target)
-        g = self._direction(model.A)
-        values = np.zeros((brief.horizon, *target.shape))
+        g, values = self._direction(model.A), np.zeros((brief.horizon, *target.shape))
         for k in range(brief.horizon):
             share = 1.0 if self.grow == 0.0 else min(1.0, (k + 1) * model.dt / self.grow)
             for i in range(model.agents):
-                values[k, i, :sensors] = share * num.matvec(model.C[i], g)
+                values[k, i, : len(model.sensors)] = share * num.matvec(model.C[i], g)
             g = num.matvec(model.A, g)
-        values = np.where(target, values, 0.0)
-        beyond = (np.abs(values) > brief.bounds).any(axis=(1, 2))
-        last = int(np.argmax(beyond)) if beyond.any() else len(values)
-        if last == 0:
-            raise NotApplicable(f"{where}.size", self.size, "a ghost whose readings stay within the bounds of the threat model")
-        return ScriptPlan(brief, target, Ghost(values[:last]))
+        return target, np.where(target, values, 0.0)
 
     def _direction(self, A: Array) -> Array:
         """Return a direction (n,) of norm `size`, after many steps of A from a random direction."""

@@ -19,7 +19,7 @@ from tailgate.core.threat import Brief
 from tailgate.evaluation.cells import Cell
 
 DOSE, USUAL = 12, "gusty-stop-and-go-v0"
-PACKAGED = {"program": "program:path=burst_jamming", "feedback": "feedback:weights.velocity=[-3,0,0,0,0]", "zoo": "zoo:name=car-following-chi2_kf-0"}
+PACKAGED = {"program": "program:path=burst_jamming", "feedback": "feedback:weights.velocity=[-3,0,0,0,0]", "segments": "segments:values.velocity=[-3,3]", "zoo": "zoo:name=car-following-chi2_kf-0"}
 MADE = {
     "policy": ("`make demo` trains it:", "runs/quickstart/policy-0.json", "--threat kinds=[fdi]"),
     "rules": ("Rules come from `tailgate distil zoo:name=car-following-chi2_kf-0 --out rules.json`:", "rules:path=rules.json",

@@ -16,7 +16,7 @@ def add(commands: Commands) -> None:
     """Add the command."""
     command = commands.add_parser(
         "attack", help="find the attacks that do most harm to a defence, and compare them with a suite's",
-        description="Attack a defence with the standard ensemble: searched scripts, programs and feedbacks, published and newly learned "
+        description="Attack a defence with the standard ensemble: searched scripts, programs and values, published and newly learned "
         "policies, and attacks that know the defence. In each scenario, at each dose, the best of every member is compared with the best "
         "attack that the suite lists, on fresh episodes.",
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The search for values that follow the road: random attacks, then CMA-ES (Hansen and Ostermeier 2001) from the best ones."""
+"""The search among points: random attacks, then CMA-ES (Hansen and Ostermeier 2001) from the best ones."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from tailgate.core import Array, Kind
+from tailgate.core import Array
 from tailgate.ensemble.evolution import SHORTER
-from tailgate.ensemble.feedbacks import Choice, Feedbacks, Point
+from tailgate.ensemble.points import Choice, Point, Points
 from tailgate.ensemble.search import FINALISTS, PROMISING, Arena, Tell
 
 if TYPE_CHECKING:
     from cmaes import CMA
 
 SCREENS = 4, 16  # episodes of every random attack, and of the best ones
-EPISODES, AGAIN = 32, 256  # of an attack, and of one that is compared in the end
+EPISODES, FEWEST = 32, 64  # of an attack, and of one that is compared in the end, at least
 GROUP, STEP = 16, 0.4  # attacks of a run in a round, and their first spread
-BEST, ENDS = 64, 48  # random attacks among which runs begin, and attacks that are compared in the end
+BEST = 64  # random attacks among which runs begin
 LEAST = 2  # runs, at least
 
 
@@ -32,16 +32,19 @@ class Stage(NamedTuple):
 
 @dataclass(frozen=True)
 class Climb:
-    """The size of a search: random attacks, for a system of one agent, and the stages of the runs."""
+    """The size of a search, for a system of one agent."""
 
-    random: int
-    stages: tuple[Stage, ...]
+    random: int  # attacks
+    stages: tuple[Stage, ...]  # of the runs
+    ends: int = 48  # attacks that are compared in the end
+    again: int = 256  # episodes of each of them
 
     def sized(self, agents: int, traced: bool = True) -> Climb:
         """Return the search for a system of this size."""
         part = 1 if traced else SHORTER
         stages = (Stage(max(runs // agents, LEAST), max(rounds // part, 1)) for runs, rounds in self.stages)
-        return Climb(max(self.random // (agents * part), BEST), tuple(stages))
+        ends, again = max(self.ends // agents, FINALISTS), max(self.again // agents, FEWEST)
+        return Climb(max(self.random // (agents * part), BEST), tuple(stages), ends, again)
 
     @property
     def screened(self) -> tuple[int, ...]:
@@ -53,7 +56,7 @@ class Climb:
         """The episodes that the search plays."""
         tried = (self.random, *self.screened), (*SCREENS, EPISODES)
         runs = GROUP * sum(runs * rounds for runs, rounds in self.stages)
-        return sum(count * each for count, each in zip(*tried, strict=True)) + EPISODES * runs + AGAIN * ENDS
+        return sum(count * each for count, each in zip(*tried, strict=True)) + EPISODES * runs + self.again * self.ends
 
 
 class Run(NamedTuple):
@@ -70,11 +73,13 @@ class Ended(NamedTuple):
     point: Point
 
 
-def climbed(arena: Arena, effort: Climb, seed: int = 0, tell: Tell | None = None) -> list[str]:
-    """Search the values that follow the road and do most harm; the same seed finds the same.
+def climbed(arena: Arena, space: Points, effort: Climb, seed: int = 0, tell: Tell | None = None) -> list[str]:
+    """Search the attacks of a space that do most harm; the same seed finds the same.
 
     Parameters
     ----------
+    space
+        The attacks, of the arena's threat model.
     effort
         The size of the search, for a system of one agent.
     tell
@@ -85,7 +90,7 @@ def climbed(arena: Arena, effort: Climb, seed: int = 0, tell: Tell | None = None
     list of str
         Attacks as on the command line, the most harmful first. Empty where the threat model grants none.
     """
-    space, effort = arena.feedbacks, effort.sized(arena.loop.model.agents, arena.traced)
+    effort = effort.sized(arena.loop.model.agents, arena.traced)
     if not space.kinds:
         return []
     rng = np.random.default_rng([seed, zlib.crc32(f"{arena.name}/{arena.dose}/{arena.defence}".encode()), 77])
@@ -94,16 +99,16 @@ def climbed(arena: Arena, effort: Climb, seed: int = 0, tell: Tell | None = None
     for episodes, left in zip(SCREENS, effort.screened, strict=True):
         points = [one.point for one in game.tried(points, episodes)[:left]]
     tried = game.tried(points)
-    runs, ends = [_run(point, rng) for point in _apart(tried, effort.stages[0].runs)], tried[:ENDS]
+    runs, ends = [_run(point, rng) for point in _apart(tried, effort.stages[0].runs)], tried[: effort.ends]
     for stage in effort.stages:
         best = {one.point.choice: one.score for one in reversed(ends)}
         runs = sorted(runs, key=lambda run: -best.get(run.choice, 0.0))[: stage.runs]
         for _ in range(stage.rounds):
-            ends = sorted([*ends, *game.moved(runs)], key=lambda one: -one.score)[:ENDS]
+            ends = sorted([*ends, *game.moved(runs)], key=lambda one: -one.score)[: effort.ends]
             done += 1
             if tell is not None:
                 tell(done, rounds, space.text(ends[0].point), ends[0].score)
-    last = game.tried([one.point for one in ends], AGAIN)
+    last = game.tried([one.point for one in ends], effort.again)
     return list(dict.fromkeys(space.text(one.point) for one in last))[:FINALISTS]
 
 
@@ -112,7 +117,7 @@ class _Game:
     """Plays attacks on episodes that the search has not played before."""
 
     arena: Arena
-    space: Feedbacks
+    space: Points
     episode: int = 0
 
     def scores(self, points: list[Point], episodes: int) -> Array:
@@ -138,13 +143,13 @@ class _Game:
 
 
 def _apart(ends: list[Ended], count: int) -> list[Point]:
-    """Return the best attacks that differ in their kind or in bursts, then those that differ in another choice."""
-    kinds: dict[tuple[Kind, bool], Point] = {}
+    """Return the best attack of each sort, then those that differ in another choice."""
+    sorts: dict[tuple[object, ...], Point] = {}
     choices: dict[Choice, Point] = {}
     for _, point in ends:
-        kinds.setdefault((point.choice.kind, point.choice.bursts), point)
+        sorts.setdefault(point.choice.sort, point)
         choices.setdefault(point.choice, point)
-    return list({point.choice: point for point in [*kinds.values(), *choices.values()]}.values())[:count]
+    return list({point.choice: point for point in [*sorts.values(), *choices.values()]}.values())[:count]
 
 
 def _run(point: Point, rng: np.random.Generator) -> Run:

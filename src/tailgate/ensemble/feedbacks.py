@@ -12,16 +12,16 @@ from tailgate.agents.scripts.feedback import FEATURES, STEEPEST, UNIT, fed_back,
 from tailgate.base.pytree import map_leaves
 from tailgate.core import Array, Command, Kind, View
 from tailgate.core.draws import Draws
-from tailgate.core.kinds import AIRED, EFFECTS
-from tailgate.core.threat import Brief, receivers
+from tailgate.core.kinds import EFFECTS
+from tailgate.core.threat import Brief
 from tailgate.ensemble.battery import opens
-from tailgate.ensemble.space import LONG, NEVER, TRIGGERS, Space
+from tailgate.ensemble.points import Point, Points, shares_of, vector_of
+from tailgate.ensemble.space import LONG, NEVER
 
 KINDS = Kind.FDI, Kind.DOS_JAM, Kind.DOS_HOLD, Kind.DROPOUT, Kind.NOISE_JAM, Kind.ECHO_DELAY  # a fresh hold is left to scripts
 SPARING = 0.3  # how often single steps of constants leave out a wire
 SIZES = np.array([2.0, 0.5, 0.5, 0.5, 0.5])  # of weights that are drawn: of a constant value more than of one that follows
 TIMES = 4  # numbers of a point behind its weights: trigger, burst, pause, switch
-STEEP, INNER = 3.0, 1e-3  # these are logistic: their steepness, and the least share of a range
 CHANGES, REPEATS, PULSES = 0.4, 0.5, 0.5  # how often a later kind, bursts, and single steps of constants are drawn
 
 
@@ -42,6 +42,11 @@ class Numbers(NamedTuple):
     def take(self, places: Array) -> Numbers:
         """Return the attacks at these places."""
         return map_leaves(lambda leaf: leaf[places], self)
+
+    @property
+    def decider(self) -> Many:
+        """The attack that plays them, another one in each row."""
+        return Many()
 
     def remembered(self) -> Memory:
         """Return the memory of the attacks at the start of their episodes."""
@@ -88,46 +93,32 @@ class Choice(NamedTuple):
     trigger: int  # place in `Space.triggers`
     bursts: bool
 
+    @property
+    def kinds(self) -> frozenset[Kind]:
+        """The kinds that it may send."""
+        return frozenset((self.kind, self.later))
 
-class Point(NamedTuple):
-    """An attack: its choices, and its weights (w * FEATURES,) and TIMES before they are brought into their ranges."""
-
-    choice: Choice
-    vector: Array
+    @property
+    def sort(self) -> tuple[object, ...]:
+        """The choices that set attacks apart."""
+        return self.kind, self.bursts
 
 
 @dataclass(frozen=True)
-class Feedbacks:
-    """Attacks of `feedback` that a threat model grants in a scenario."""
-
-    space: Space  # of scripts in the same place
-
-    @property
-    def brief(self) -> Brief:
-        """The grant of the attacker."""
-        return self.space.brief
+class Feedbacks(Points):
+    """Attacks of `feedback` that a threat model grants in a scenario. A point has the weights (w * FEATURES,) and TIMES."""
 
     @cached_property
     def kinds(self) -> tuple[Kind, ...]:
-        """The kinds that are granted, and have a receiver; empty if none has a value, or nobody drives."""
-        heard = bool(receivers(self.brief).any())
-        kinds = [kind for kind in KINDS if kind.name.lower() in self.brief.threat.kinds and (heard or kind not in AIRED)]
-        return tuple(kinds) if any(EFFECTS[kind].valued for kind in kinds) and self.space.road else ()
-
-    @property
-    def wires(self) -> tuple[str, ...]:
-        """The wires of an agent."""
-        return self.brief.model.wires
+        """The kinds of the attacks; empty: there are none."""
+        return self.granted(KINDS)
 
     def drawn(self, rng: np.random.Generator) -> Point:
         """Return an attack at random."""
         space = self.space
         kind, later = (self.kinds[int(rng.integers(len(self.kinds)))] for _ in range(2))
-        choice = Choice(
-            kind, later if rng.random() < CHANGES else kind, int(rng.integers(len(space.wires))),
-            space.agents[int(rng.integers(len(space.agents)))], int(rng.integers(len(space.triggers))),
-            bool(rng.random() < REPEATS and space.budget > 1),
-        )  # fmt: skip
+        later = later if rng.random() < CHANGES else kind
+        choice = Choice(kind, later, *self.aim(rng), bool(rng.random() < REPEATS and space.budget > 1))
         weights, shares = rng.standard_normal((len(self.wires), FEATURES)) * SIZES, rng.uniform(0.0, 1.0, TIMES)
         if rng.random() < PULSES and space.budget > 1:  # another constant on each wire, in single steps
             valued = [one for one in self.kinds if EFFECTS[one].valued]
@@ -136,8 +127,7 @@ class Feedbacks:
             most = min(np.arcsinh(space.reach(kind)[1] / UNIT), STEEPEST)
             weights = rng.uniform(-most, most, len(weights))[:, None] * np.eye(FEATURES)[0]
             shares[1:3] = 0.0, np.log(rng.integers(1, LONG + 1)) / np.log(LONG)
-        shares = np.clip(shares, INNER, 1.0 - INNER)
-        return Point(choice, np.concatenate([weights.ravel(), np.log(shares / (1.0 - shares)) / STEEP]))
+        return Point(choice, np.concatenate([weights.ravel(), vector_of(shares)]))
 
     def numbers(self, points: list[Point]) -> Numbers:
         """Return the numbers of attacks."""
@@ -146,17 +136,10 @@ class Feedbacks:
 
     def _row(self, point: Point) -> Numbers:
         """Return the numbers of one attack, without their first axis."""
-        choice, brief, space = point.choice, self.brief, self.space
-        when, burst, pause, switch = (1.0 / (1.0 + np.exp(-STEEP * point.vector[-TIMES:]))).tolist()  # in (0, 1)
-        weights = np.round(point.vector[:-TIMES].reshape(len(self.wires), FEATURES), 3)
-        names, budget = space.wires[choice.wires], max(space.budget, 1)
-        target = brief.granted & np.array([not names or name in names for name in self.wires])
-        if {choice.kind, choice.later} & set(AIRED):
-            target = target & receivers(brief) if (target & receivers(brief)).any() else receivers(brief)
-        if choice.agent is not None:
-            target = target & (np.arange(len(target)) == choice.agent)[:, None]
-        genes = np.array([(choice.trigger + 0.5) / len(space.triggers)]), np.array([when])
-        trigger, threshold, start = (part[0] for part in space.opening(*genes))
+        choice, budget = point.choice, max(self.space.budget, 1)
+        when, burst, pause, switch = shares_of(point.vector[-TIMES:])
+        weights, target = np.round(point.vector[:-TIMES].reshape(len(self.wires), FEATURES), 3), self.target(choice)
+        trigger, threshold, start = self.opening(choice, when)
         steps = (
             choice.kind, choice.later, max(1, int(budget * switch)) if choice.later != choice.kind else NEVER, start,
             max(1, round((budget / 2.0) ** burst)) if choice.bursts else NEVER, max(1, round(LONG**pause)) if choice.bursts else 0,
@@ -171,17 +154,11 @@ class Feedbacks:
         parts = [f"kind={choice.kind.name.lower()}"]
         if choice.later != choice.kind:
             parts += [f"later={choice.later.name.lower()}", f"switch={one.switch}"]
-        aired, hit = bool({choice.kind, choice.later} & set(AIRED)), np.asarray(one.target.any(axis=0))
-        if (hit != (receivers(self.brief) if aired else self.brief.granted).any(axis=0)).any():
-            parts.append(f"targets=[{','.join(name for name, on in zip(self.wires, hit, strict=True) if on)}]")
-        if choice.agent is not None:
-            parts.append(f"agents=[{choice.agent}]")
-        name = TRIGGERS[int(one.trigger)]
-        parts.append(f"start_step={one.start}" if name == "time" else f"trigger={name},threshold={one.threshold!s}")
+        parts += self.words(choice, shares_of(point.vector[-TIMES:])[0])
         if choice.bursts:
             parts.append(f"burst={one.burst},pause={one.pause}")
-        if EFFECTS[choice.kind].valued or EFFECTS[choice.later].valued:
-            for name, held, on in zip(self.wires, one.weights[0].tolist(), hit, strict=True):
+        if any(EFFECTS[kind].valued for kind in choice.kinds):
+            for name, held, on in zip(self.wires, one.weights[0].tolist(), np.asarray(one.target.any(axis=0)), strict=True):
                 if on:
                     parts.append(f"weights.{name}=[{','.join(map(str, held))}]")
         return f"feedback:{','.join(parts)}"

@@ -18,6 +18,7 @@ from tailgate.engine.untraceable import Untraceable
 from tailgate.ensemble.climb import Climb, Stage, climbed
 from tailgate.ensemble.gradient import Pace, gradient
 from tailgate.ensemble.networks import FORMS, PUBLISHED, Phase, Race, is_ramp, learned, transferred
+from tailgate.ensemble.points import Points
 from tailgate.ensemble.published import found_against_others
 from tailgate.ensemble.search import FINALISTS, Arena, Effort, Found, Meaningless, Tell, search
 
@@ -34,7 +35,8 @@ class Budget:
 
     scripts: Effort
     programs: Effort
-    feedback: Climb
+    climb: Climb  # of feedback, and of segments
+    ghosts: Climb
     population: int  # of a generation of policies
     phases: tuple[tuple[int, int], ...]  # of the race of policies: generations, and episodes of each member
     pace: Pace  # of the gradient attack
@@ -48,18 +50,18 @@ class Budget:
         """Return the episodes that all members play in a scenario, about; those that do not learn unless `whole`."""
         race = self.race if traced else self.race.shorter()
         races = race.episodes(STARTS, agents) + race.episodes(GREY + PUBLISHED, agents)
-        scripts = self.scripts.episodes(agents) + self.programs.episodes(agents) + self.feedback.sized(agents, traced).episodes
+        scripts = self.scripts.episodes(agents) + self.programs.episodes(agents) + 2 * self.climb.sized(agents, traced).episodes
         return scripts + (races if whole else 0)
 
 
 BUDGETS = {
     "quick": Budget(
-        Effort(512, 5), Effort(256, 4), Climb(8192, (Stage(8, 12), Stage(4, 12), Stage(2, 24))), 32, ((16, 16), (12, 32), (24, 64)),
-        Pace(256, 1, 8, 64),
+        Effort(512, 5), Effort(256, 4), Climb(8192, (Stage(8, 12), Stage(4, 12), Stage(2, 24))),
+        Climb(640, (Stage(20, 6),)), 32, ((16, 16), (12, 32), (24, 64)), Pace(256, 1, 8, 64),
     ),
     "standard": Budget(
-        Effort(2048, 12), Effort(1024, 10), Climb(32768, (Stage(16, 16), Stage(8, 32), Stage(4, 64))), 64, ((40, 32), (40, 64), (60, 128)),
-        Pace(2048, 2, 20, 128),
+        Effort(2048, 12), Effort(1024, 10), Climb(32768, (Stage(16, 16), Stage(8, 32), Stage(4, 64))),
+        Climb(2560, (Stage(40, 12),)), 64, ((40, 32), (40, 64), (60, 128)), Pace(2048, 2, 20, 128),
     ),
 }
 
@@ -110,9 +112,25 @@ def _programs(hunt: Hunt) -> list[str]:
 
 def _feedback(hunt: Hunt) -> list[str]:
     """Search values that follow the road, of every kind."""
+    return _climbed(hunt, hunt.arena.feedbacks)
+
+
+def _segments(hunt: Hunt) -> list[str]:
+    """Search lies one after the other, of every kind with a value."""
+    return _climbed(hunt, hunt.arena.segments)
+
+
+def _ghosts(hunt: Hunt) -> list[str]:
+    """Search the readings of a second state, of every size and growth."""
+    if hunt.arena.space.road:
+        raise Meaningless("scenario", hunt.arena.name, "one where nobody drives: segments and feedback search what lasts on a road")
+    return climbed(hunt.arena, hunt.arena.ghosts, hunt.budget.ghosts, hunt.seed, hunt.tell)
+
+
+def _climbed(hunt: Hunt, space: Points) -> list[str]:
     if not hunt.arena.space.road:
         raise Meaningless("scenario", hunt.arena.name, "one with a road: nobody drives here")
-    return climbed(hunt.arena, hunt.budget.feedback, hunt.seed, hunt.tell)
+    return climbed(hunt.arena, space, hunt.budget.climb, hunt.seed, hunt.tell)
 
 
 def _policies(hunt: Hunt, knowledge: str) -> list[str]:
@@ -170,6 +188,8 @@ MEMBERS = (
     Member("scripts", "black", _scripts, 7),
     Member("programs", "black", _programs, 7),
     Member("feedback", "black", _feedback, 10),
+    Member("segments", "black", _segments, 10),
+    Member("ghosts", "black", _ghosts, 3),
     Member("transfer", "black", _transfer, 1),
     Member("networks", "black", lambda hunt: _policies(hunt, "black"), 42, learns=True),
     Member("grey networks", "grey", lambda hunt: _policies(hunt, "grey"), 26, learns=True),

@@ -23,8 +23,11 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import load_scenario
 from tailgate.engine.agreement import ROWS, Untraced
 from tailgate.ensemble.battery import Decider, Episodes, Played, Scripts, battery_of, played_plainly, remembered
-from tailgate.ensemble.feedbacks import Feedbacks, Many, Numbers
+from tailgate.ensemble.feedbacks import Feedbacks
+from tailgate.ensemble.ghosts import Ghosts
+from tailgate.ensemble.points import Numbers
 from tailgate.ensemble.programs import Programs
+from tailgate.ensemble.segments import Lines
 from tailgate.ensemble.space import Sequence, Space, road_of
 from tailgate.evaluation.cells import Cell
 from tailgate.play.metrics import METRICS
@@ -134,6 +137,16 @@ class Arena:
     def feedbacks(self) -> Feedbacks:
         """The values that follow the road that are granted here."""
         return Feedbacks(self.space)
+
+    @cached_property
+    def segments(self) -> Lines:
+        """The lies in segments that are granted here."""
+        return Lines(self.space)
+
+    @cached_property
+    def ghosts(self) -> Ghosts:
+        """The ghosts that are granted here."""
+        return Ghosts(self.space)
 
     @cached_property
     def start(self) -> float:
@@ -266,9 +279,9 @@ class Arena:
 
 def at_start(scripts: Sequence | Numbers, agents: int) -> tuple[Decider, object]:
     """Return the attack that plays scripts, and its memory at the start of their episodes."""
-    if isinstance(scripts, Numbers):
-        return Many(), scripts.remembered()
-    return Scripts(len(scripts.phases) > 1), remembered(scripts, agents)
+    if isinstance(scripts, Sequence):
+        return Scripts(len(scripts.phases) > 1), remembered(scripts, agents)
+    return scripts.decider, scripts.remembered()
 
 
 def _whole(loop: Loop, attack: Attack, keys: Keys) -> Played | None:
