@@ -3,7 +3,7 @@
     python benchmarks/searched_again.py radar-v1 [--budget quick] [--seed 0] [--workers 2] [--json FILE]
 
 Each ranked figure at black box that leaves more than 10 % undamaged is searched: by `scripts` and `transfer` in every scenario, by
-`feedback` in that of its worst attack, or in every one if nothing does harm yet. The best attack of each search then meets 2000 fresh
+`feedback`, `segments` and `ghosts` in that of its worst attack, or in every one if nothing does harm yet. The best attack of each search then meets 2000 fresh
 episodes. The same seed finds the same attacks.
 """
 
@@ -52,7 +52,7 @@ def searched(figure: Figure, budget: str, seed: int) -> dict[str, Any]:
         for place in suite.scenarios:
             arena = Arena(suite.name, place, figure.dose, figure.defence, dict(suite.granted), suite.bound, suite.progress)
             here = place == figure.scenario or not figure.published
-            only = ("scripts", "feedback", "transfer") if here else ("scripts", "transfer")
+            only = ("scripts", "feedback", "segments", "ghosts", "transfer") if here else ("scripts", "transfer")
             best = [one.found[0].attack for one in harvest(Hunt(arena, BUDGETS[budget], seed, Path(folder), only=only)) if one.found]
             found += [(arena.confirmed(attack, "report", FIRST_FRESH, FRESH)[0], place, attack) for attack in best]
     damage, place, attack = max(found, key=lambda one: one[0])
