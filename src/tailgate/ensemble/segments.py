@@ -22,7 +22,7 @@ KINDS = Kind.FDI, Kind.DOS_JAM, Kind.NOISE_JAM, Kind.ECHO_DELAY
 MOST = 3  # segments
 GROWTH = 0.1 * UNIT  # of a rate near 0 [unit of the wire per step]
 SMALL = 1.0  # the least bound of an attack's numbers: values of 0.12
-GROWING, SINGLE = 0.6, 0.35  # how often growth, and single steps with pauses are drawn
+GROWING, SINGLE, WAITS = 0.6, 0.35, 0.4  # how often growth, single steps with pauses, and a wait between lies are drawn
 
 
 class Numbers(NamedTuple):
@@ -118,6 +118,10 @@ class Lines(Points):
         rates = rng.standard_normal(values.shape) * (rng.random(values.shape) < GROWING)
         shares = rng.random(1 + 3 * MOST)
         shares[1 + MOST : 1 + 2 * MOST] **= 0.5  # long segments rather than short ones
+        if len(single) > 1 and rng.random() < WAITS:  # a small lie, a wait of any length, and a large lie
+            values[0] = rng.uniform(-SMALL, SMALL, len(self.wires)) * 2.0
+            values[1] = np.sign(values[1]) * rng.uniform(most / 2.0, most, len(self.wires))
+            shares[2] = np.log(rng.integers(1, LONG + 1)) / np.log(LONG)
         return Point(choice, np.concatenate([vector_of(shares), values.ravel(), rates.ravel()]))
 
     def numbers(self, points: list[Point]) -> Numbers:
