@@ -7,8 +7,8 @@ Each method has four parts, each in its own file. Parts that exist are not playe
 * calibrated: the threshold for one false alarm in HOURS of clean driving, and the clean errors
 * compromised: the position error under a bias, and under a ramp, on 0, 1, ..., 7 of the sensors, the most accurate first
 * listed: a bias of -30 on two sensors for 50 steps: collisions, and if the alarm sounds
-* searched: what scripts, programs and feedbacks of the standard ensemble, budget quick, do where two sensors can be reached. A method that
-  is not traced meets what was found against the others instead. With --no-search only what exists is shown
+* searched: what scripts, programs and feedbacks of the standard ensemble, budget quick, do where two sensors can be reached. With
+  --no-search only what exists is shown
 
 --show plays nothing: figure and table are of the parts that exist.
 """
@@ -35,7 +35,6 @@ from tailgate.core.registry import Spec
 from tailgate.core.scenario import Scenario, load_scenario, load_suite
 from tailgate.core.spec_text import split_text
 from tailgate.ensemble.members import BUDGETS, Hunt, harvest
-from tailgate.ensemble.search import Arena
 from tailgate.ensemble.standard import jobs_of
 from tailgate.evaluation.calibrate import calibrate
 from tailgate.evaluation.stats import proportion
@@ -58,7 +57,6 @@ METHODS = {
     "envelope": "envelope:path=redundant",
 }
 SLOW = ("l0_robust",)  # is not traced: a search against it would take days
-TRIED = 10  # select episodes of each attack that such a method meets
 ORDER = ("lidar", "radar_long", "wheels", "radar_short", "v2v", "gnss", "camera")  # the most accurate first
 SCENARIO, SUITE, DOSE = "redundant-two-v0", "redundant-v0", 50
 HOURS, ONSETS, EPISODES = 0.1, 60, 100
@@ -129,42 +127,14 @@ def searched(text: str, scratch: Path) -> dict[str, Any]:
     members = harvest(Hunt(arena, BUDGETS[BUDGET], 0, folder, only=MEMBERS))
 
     def harm(against: str) -> dict[str, Any]:
-        return harmed(arena, against, folder)
+        share = proportion(round(arena.confirmed(against, "report", 0, EPISODES)[0] * EPISODES), EPISODES)
+        return {"attack": against.replace(f"{folder}/", ""), "damage": share.value, "low": share.low, "high": share.high}
 
     best = max((one.found[0] for one in members if one.found), key=lambda found: found.score)
     tried = {one: arena.confirmed(one, "select", 0, EPISODES)[1] for one in suite.attacks if Spec("attack", one).entry.knowledge == "black"}
     who = [{"member": one.member, "knowledge": one.knowledge, **harm(one.found[0].attack)} for one in members if one.found]
     out = {"defence": text, "budget": BUDGET, "only": list(MEMBERS), "listed": harm(max(tried, key=lambda one: tried[one]))}
     return out | {"found": harm(best.attack), "members": who}
-
-
-def transferred(text: str, others: dict[str, dict[str, Any]], scratch: Path) -> dict[str, Any]:
-    """Play what was found against the other methods; `others` has their searches, and `scratch` the files of these in folders."""
-    suite = load_suite(SUITE)
-    arena = jobs_of(suite, text, (SCENARIO,), (DOSE,), BUDGET, 0)[0].arena
-    found = [
-        one["attack"].replace("path=", f"path={folder_of(scratch, name)}/")
-        for name, cell in others.items() for one in cell["members"] if one["damage"] > 0.0
-    ]  # fmt: skip
-    black = [one for one in suite.attacks if Spec("attack", one).entry.knowledge == "black"]
-    tried = {one: arena.confirmed(one, "select", 0, TRIED)[1] for one in dict.fromkeys([*black, *found])}
-    listed, best = (max(some, key=lambda one: tried[one]) for some in (black, found))
-    if tried[listed] > tried[best]:
-        best = listed
-    harm = harmed(arena, best, scratch)
-    who = [{"member": "found against others", "knowledge": "black", **harm}]
-    return {"defence": text, "only": ["transfer"], "listed": harmed(arena, listed, scratch), "found": harm, "members": who}
-
-
-def harmed(arena: Arena, against: str, folder: Path) -> dict[str, Any]:
-    """Return what an attack damages in report episodes; its text is without the folder."""
-    share = proportion(round(arena.confirmed(against, "report", 0, EPISODES)[0] * EPISODES), EPISODES)
-    return {"attack": against.replace(f"{folder}/", ""), "damage": share.value, "low": share.low, "high": share.high}
-
-
-def folder_of(scratch: Path, method: str) -> Path:
-    """Return the folder of a method's search."""
-    return scratch / method.replace(", ", "-")
 
 
 def part(out: Path, name: str, method: str, make: Callable[[], dict[str, Any]] | None) -> dict[str, Any] | None:
@@ -247,22 +217,15 @@ def main() -> int:
         "calibrated": lambda name: calibrated(METHODS[name]),
         "compromised": lambda name: compromised(held[name]["calibrated"]["defence"]),
         "listed": lambda name: listed(held[name]["calibrated"]["defence"]),
-        "searched": lambda name: search_of(name),
+        "searched": lambda name: searched(held[name]["calibrated"]["defence"], options.scratch / name.replace(", ", "-")),
     }
-
-    def search_of(name: str) -> dict[str, Any]:
-        text = held[name]["calibrated"]["defence"]
-        if name not in SLOW:
-            return searched(text, folder_of(options.scratch, name))
-        return transferred(text, {one: cell for one, parts in held.items() if (cell := parts.get("searched"))}, options.scratch)
-
     try:
         with progress(Console(stderr=True)) as update:
             for number, (kind, make) in enumerate(makers.items()):
                 writable_directory(options.out / kind, "--out")
-                for done, name in enumerate(sorted(names, key=lambda name: name in SLOW)):  # these meet what the others' searches found
+                for done, name in enumerate(names):
                     update(kind, number * len(names) + done, len(makers) * len(names), name)
-                    left_out = options.show or (kind == "searched" and options.no_search)
+                    left_out = options.show or (kind == "searched" and (options.no_search or name in SLOW))
                     held[name][kind] = part(options.out, kind, name, None if left_out else partial(make, name))
     except (InputError, NotApplicable) as error:
         print(f"literature: error: {error}", file=sys.stderr)

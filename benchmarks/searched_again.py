@@ -3,8 +3,8 @@
     python benchmarks/searched_again.py radar-v1 [--budget quick] [--seed 0] [--workers 2] [--json FILE]
 
 Each ranked figure at black box that leaves more than 10 % undamaged is searched: by `scripts` and `transfer` in every scenario, by
-`feedback`, `segments` and `ghosts` in that of its worst attack, or in every one if nothing does harm yet. The best attack of each search then meets 2000 fresh
-episodes. The same seed finds the same attacks.
+`feedback`, `segments` and `ghosts` in that of its worst attack, or in every one if nothing does harm yet. The best attack of each search
+then meets 2000 fresh episodes. The same seed finds the same attacks.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,21 @@ def test_a_defence_does_not_meet_what_was_found_against_itself(tmp_path: Path) -
 
 def test_a_suite_without_a_board_has_none(tmp_path: Path) -> None:
     assert found_against_others(braking("reacquire_kf", "platoon-v0"), tmp_path) == [] and not list(tmp_path.iterdir())
+
+
+def test_another_grant_under_the_same_name_meets_none(tmp_path: Path) -> None:
+    """Its policies were trained with other actions: to prepare one is an error."""
+    place = braking("reacquire_kf")
+    other = dataclasses.replace(place, threat=place.threat | {"delay_bound": 10.0})
+    assert found_against_others(place, tmp_path) and found_against_others(other, tmp_path) == []
+
+
+def test_what_was_transferred_is_not_packed_again() -> None:
+    member = {"knowledge": "black", "attack": "fdi:value=1"}
+    cell = {"scenario": "road", "dose": 4, "members": [member | {"member": name} for name in ("transfer", "scripts", "white box")]}
+    cell["members"][2] |= {"knowledge": "white"}
+    board = {"suite": {"name": "quick-v1"}, "searches": [{"defence": "kf", "cells": [cell]}]}
+    assert [line["attack"] for line in packed(board, Path())["attacks"]] == ["fdi:value=1"]
 
 
 def test_transfer_finds_the_policy_that_was_learned_against_another(tmp_path: Path) -> None:

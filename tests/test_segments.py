@@ -38,6 +38,11 @@ def test_each_segment_rests_then_lies_with_its_own_values() -> None:
         assert trace.value[step - 1, :, 0, :2].tolist() == [list(values)] * 3
 
 
+def test_a_single_segment_needs_no_rests_and_keeps_the_windows_bursts() -> None:
+    trace = played(ROAD, Segments(start_step=60, length=7, burst=2, pause=1, steps=(9,), values={"position": (2.0,)}))
+    assert [int(step) + 1 for step in np.flatnonzero(trace.target[:, 0, 0, 0])] == [60, 61, 63, 64, 66]
+
+
 def test_values_are_cut_at_the_bound_and_sizes_count_over_the_air() -> None:
     far = played(ROAD, Segments(values={"position": (9.0, -9.0)}), fdi_bound=3.0)
     assert np.unique(far.value[..., 0]).tolist() == [-3.0, 0.0, 3.0]
@@ -69,10 +74,10 @@ def test_the_engine_plays_the_same(place: str, defence: str, text: str) -> None:
     ("text", "error", "words"),
     [
         ("segments:values.gap=[1,2]", InputError, r"values: got 'gap'; expected wires \(position, velocity"),
-        ("segments:values.position=[1]", InputError, r"values.position: got \[1.0\]; expected 2 numbers, one for each of steps"),
-        ("segments:values.position=[1,2],rests=[1,2,3]", InputError, r"rests: got .*; expected 2 numbers"),
+        ("segments:values.position=[1]", InputError, r"values.position: got \[1.0\]; expected as many numbers as steps has \(2\)"),
+        ("segments:values.position=[1,2],rests=[1,2,3]", InputError, r"rests: got .*; expected as many numbers as steps has"),
         ("segments:values.position=[1,2],steps=[0,2]", InputError, "steps"),
-        ("segments:steps=[],rests=[],pauses=[]", InputError, "steps: got .*; expected at least one segment"),
+        ("segments:steps=[]", InputError, "steps: got .*; expected at least one segment"),
         ("segments", NotApplicable, r"values: got None; expected numbers for a wire, such as values.position=\[-3,-3\]"),
         ("segments:targets=[position],values.velocity=[1,2]", InputError, "values: got 'velocity'; expected a wire that is attacked"),
         ("segments:kind=dropout,values.position=[1,2]", InputError, "kind: got 'dropout'"),

@@ -49,9 +49,9 @@ class Segments(Script):
     """
 
     kind: Literal["fdi", "dos_jam", "noise_jam", "echo_delay"] = param("fdi", "kind of the attack")
-    rests: tuple[Count, ...] = param((0, 10), "honest steps before each segment")
+    rests: tuple[Count, ...] = param((), "honest steps before each segment; empty: none")
     steps: tuple[PositiveCount, ...] = param((10, 10), "false steps of each segment")
-    pauses: tuple[Count, ...] = param((0, 0), "honest steps between two false ones of each segment")
+    pauses: tuple[Count, ...] = param((), "honest steps between two false ones of each segment; empty: none")
     values: dict[str, tuple[Finite, ...]] | None = param(
         None, "first value of each segment, for each wire by name; the other wires get 0. It is needed [unit of the wire]", if_any=True
     )
@@ -60,14 +60,14 @@ class Segments(Script):
     )
 
     def __post_init__(self) -> None:
-        fields: dict[str, tuple[float, ...]] = {"rests": self.rests, "pauses": self.pauses}
+        if not self.steps:
+            raise InputError("attack segments.steps", [], "at least one segment")
+        fields: dict[str, tuple[float, ...]] = {"rests": self.rests or self.steps, "pauses": self.pauses or self.steps}
         for name, held in (("values", self.values), ("rates", self.rates)):
             fields |= {f"{name}.{wire}": numbers for wire, numbers in (held or {}).items()}
         for name, numbers in fields.items():
             if len(numbers) != len(self.steps):
-                raise InputError(f"attack segments.{name}", list(numbers), f"{len(self.steps)} numbers, one for each of steps")
-        if not self.steps:
-            raise InputError("attack segments.steps", [], "at least one segment")
+                raise InputError(f"attack segments.{name}", list(numbers), f"as many numbers as steps has ({len(self.steps)})")
 
     def prepare(self, brief: Brief) -> ScriptPlan:
         where, wires = "attack segments", brief.model.wires
@@ -83,9 +83,10 @@ class Segments(Script):
                     raise InputError(f"{where}.{field}", name, f"wires ({', '.join(wires)})")
                 if not target[:, wires.index(name)].any():
                     raise InputError(f"{where}.{field}", name, "a wire that is attacked: see targets")
-        none = (0.0,) * len(self.steps)
-        values, rates = (np.array([held.get(name, none) for name in wires]).T for held in (self.values, self.rates or {}))
-        rests, steps, pauses = (np.array(part, np.int64) for part in (self.rests, self.steps, self.pauses))
+        still = (0.0,) * len(self.steps)
+        values, rates = (np.array([held.get(name, still) for name in wires]).T for held in (self.values, self.rates or {}))
+        none = (0,) * len(self.steps)
+        rests, steps, pauses = (np.array(part or none, np.int64) for part in (self.rests, self.steps, self.pauses))
         return self.plan(brief, target, Lies(rests, steps, pauses, values, rates))
 
     def command(self, plan: ScriptPlan, on: Array, count: Array, view: View, draws: Draws) -> Command:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,11 @@ from tailgate.core.draws import Draws, constants
 from tailgate.core.quantities import Settling
 from tailgate.core.registry import register
 from tailgate.core.threat import Brief
+
+
+def grown(count: Array | int, dt: float, grow: Array | float) -> Any:
+    """Return the share of its size that a ghost has `count` steps after it began. grow: [s]; 0: at once."""
+    return np.minimum((count + 1) * dt / np.where(grow > 0.0, grow, dt), 1.0)
 
 
 def within(brief: Brief, values: Array) -> int:
@@ -60,7 +65,7 @@ class GhostState(Script):
         require(brief, where, ["fdi"], target)
         g, values = self._direction(model.A), np.zeros((brief.horizon, *target.shape))
         for k in range(brief.horizon):
-            share = 1.0 if self.grow == 0.0 else min(1.0, (k + 1) * model.dt / self.grow)
+            share = grown(k, model.dt, self.grow)
             for i in range(model.agents):
                 values[k, i, : len(model.sensors)] = share * num.matvec(model.C[i], g)
             g = num.matvec(model.A, g)

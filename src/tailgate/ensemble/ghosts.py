@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tailgate import num
-from tailgate.agents.white_box.ghost import GhostState, within
+from tailgate.agents.white_box.ghost import GhostState, grown, within
 from tailgate.base.errors import NotApplicable
 from tailgate.core import Array, Command, Kind, View
 from tailgate.core.draws import Draws
@@ -82,7 +82,7 @@ class Many:
         one, count, steps = memory.rows, memory.elapsed, self.table.shape[1]
         opened = memory.opened | opens(plan, view, one, memory.lead_speed)
         on = opened & view.allowed & (count < one.last)
-        share = np.minimum((count + 1) * plan.model.dt / np.where(one.grow > 0.0, one.grow, plan.model.dt), 1.0)
+        share = grown(count, plan.model.dt, one.grow)
         flat = self.table.reshape(-1, *self.table.shape[2:])
         raw = num.take(flat, one.mode * steps + np.minimum(count, steps - 1)) * (one.size * share)[:, None, None]
         target = on[:, None, None] & (np.arange(plan.granted.shape[1]) < len(plan.model.sensors)) & plan.granted
@@ -144,8 +144,9 @@ class Ghosts(Points):
         most = self.space.reach(Kind.FDI)[1]
         size = float(f"{most * SMALLEST ** (1.0 - size):.4g}")
         grow = float(f"{SLOWEST * brief.horizon * brief.model.dt * grow:.4g}") if choice.grows else 0.0
-        share = np.minimum((np.arange(brief.horizon) + 1) * brief.model.dt / (grow or brief.model.dt), 1.0)
-        last = within(brief, size * share[:, None, None] * self.table[choice.mode])
+        share, unit = grown(np.arange(brief.horizon), brief.model.dt, grow), self.table[choice.mode]
+        size = min(size, float(f"{0.999 / np.max(np.abs(share[0] * unit[0]) / brief.bounds):.3g}"))  # else it ends before it begins
+        last = within(brief, size * share[:, None, None] * unit)
         mode, length = (np.array(number, np.int64) for number in (choice.mode, last))
         return Rows(np.array(size), np.array(grow), mode, length, *self.opening(choice, when))
 

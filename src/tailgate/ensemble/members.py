@@ -117,6 +117,8 @@ def _feedback(hunt: Hunt) -> list[str]:
 
 def _segments(hunt: Hunt) -> list[str]:
     """Search lies one after the other, of every kind with a value."""
+    if hunt.arena.space.budget < 2:
+        raise Meaningless("dose", hunt.arena.space.budget, "2 attacked steps or more: feedback searches single ones")
     return _climbed(hunt, hunt.arena.segments)
 
 

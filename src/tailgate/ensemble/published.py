@@ -13,6 +13,8 @@ from typing import Any
 
 from tailgate.base.files import write_atomic
 from tailgate.base.reading import load_json
+from tailgate.core.scenario import load_suite
+from tailgate.core.schema import as_data
 from tailgate.ensemble.search import Arena
 
 FOLDER = Path(str(files("tailgate.configs").joinpath("found")))
@@ -32,10 +34,12 @@ def found_against_others(arena: Arena, folder: Path) -> list[str]:
     Returns
     -------
     list of str
-        Attacks as on the command line, each once. Empty for a suite without a published board.
+        Attacks as on the command line, each once. Empty for a suite without a published board, and for another grant.
     """
     held, own, out = _of(arena.suite), arena.defence.partition(":")[0], []
-    for line in held.get("attacks", ()):
+    if not held or held["threat"] != as_data(dict(arena.threat)):  # a suite of somebody else with this name
+        return []
+    for line in held["attacks"]:
         if (line["scenario"], line["dose"]) != (arena.name, arena.dose) or line["defence"].partition(":")[0] == own:
             continue
         text, mark, name = line["attack"].partition(PATH)
@@ -50,8 +54,8 @@ def packed(board: dict[str, Any], folder: Path) -> dict[str, Any]:
     for line in board["searches"]:
         for cell in line["cells"]:
             for one in cell["members"]:
-                if not one["attack"] or (one["knowledge"] != "black" and one["member"] != "gradient"):
-                    continue  # a gradient's values are a program: to play them asks for no knowledge
+                if not one["attack"] or one["member"] == "transfer" or (one["knowledge"] != "black" and one["member"] != "gradient"):
+                    continue  # what was transferred is there already; a gradient's values are a program, which asks for no knowledge
                 text, mark, name = one["attack"].partition(PATH)
                 if mark:
                     _put(contents, folder / name)
@@ -59,7 +63,8 @@ def packed(board: dict[str, Any], folder: Path) -> dict[str, Any]:
                     "scenario": cell["scenario"], "dose": cell["dose"], "defence": line["defence"],
                     "attack": f"{text}{mark}{Path(name).name}" if mark else text,
                 })  # fmt: skip
-    return {"suite": board["suite"]["name"], "attacks": lines, "files": contents}
+    suite = board["suite"]["name"]
+    return {"suite": suite, "threat": as_data(dict(load_suite(suite).granted)), "attacks": lines, "files": contents}
 
 
 @functools.cache
