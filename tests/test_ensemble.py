@@ -159,24 +159,16 @@ def test_a_climb_finds_more_than_the_random_attacks_that_it_begins_with(form):
     assert climbed(arena("network"), getattr(arena("network"), form), effort) == []
 
 
-def test_segments_leave_a_single_step_to_feedback(tmp_path):
-    place = dataclasses.replace(arena("car"), dose=1)
-    (held,) = members.harvest(members.Hunt(place, standard.BUDGETS["quick"], 0, tmp_path, only=("segments",)))
-    assert held.found == [] and held.why == "dose: got 1; expected 2 attacked steps or more: feedback searches single ones"
-
-
 def test_ghosts_play_what_their_text_says_to_the_last_digits():
     """Each ends before a reading leaves the bounds; where cars drive there are none."""
     place, rng = arena("network"), np.random.default_rng(3)
-    space = place.ghosts
-    points = [space.drawn(rng) for _ in range(12)]
-    outcome, moved = played(place, space.numbers(points)), 0
-    for i, text in enumerate(map(space.text, points)):
-        wanted, _ = as_evaluated(place, text)
-        mine = outcome.error[i * EPISODES : (i + 1) * EPISODES]
+    points = [place.ghosts.drawn(rng) for _ in range(12)]
+    outcome, moved = played(place, place.ghosts.numbers(points)), 0
+    for i, text in enumerate(map(place.ghosts.text, points)):
+        wanted, mine = as_evaluated(place, text)[0], outcome.error[i * EPISODES : (i + 1) * EPISODES]
         assert np.allclose(mine, wanted.error, rtol=1e-9), text
         moved += bool((mine > 2.0 * np.median(outcome.error)).any())
-    assert (space.numbers(points).last > 0).all()
+    assert (place.ghosts.numbers(points).last > 0).all()
     assert moved and {point.choice.grows for point in points} == {True, False}
     assert not arena("car").ghosts.kinds
 

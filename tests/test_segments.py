@@ -1,6 +1,7 @@
 """The attack `segments`: lies one after the other."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +10,9 @@ from tailgate.agents.scripts.segments import Segments
 from tailgate.base.errors import InputError, NotApplicable
 from tailgate.core import draws
 from tailgate.core.registry import Spec
-from tailgate.core.scenario import load_scenario
+from tailgate.core.scenario import load_scenario, load_suite
+from tailgate.ensemble.members import BUDGETS, Hunt, harvest
+from tailgate.ensemble.search import Arena
 from tailgate.play.trace import Trace, rollout
 
 ROAD = "gusty-stop-and-go-v0"
@@ -91,3 +94,10 @@ def test_wrong_words_are_named(text: str, error: type[Exception], words: str) ->
 def test_a_kind_that_is_not_granted_has_no_meaning() -> None:
     with pytest.raises(NotApplicable, match="a threat model that grants dos_jam"):
         Spec("attack", "segments:kind=dos_jam,values.position=[1,2]").make().prepare(load_scenario(ROAD).with_threat(kinds=["fdi"]).brief())
+
+
+def test_the_search_leaves_a_single_step_to_feedback(tmp_path: Path) -> None:
+    suite = load_suite("quick-v1")
+    place = Arena(suite.name, ROAD, 1, "kf", dict(suite.granted), suite.bound, suite.progress)
+    (held,) = harvest(Hunt(place, BUDGETS["quick"], 0, tmp_path, only=("segments",)))
+    assert held.found == [] and held.why == "dose: got 1; expected 2 attacked steps or more: feedback searches single ones"

@@ -15,7 +15,7 @@ from tailgate.core.draws import Draws
 from tailgate.core.kinds import EFFECTS
 from tailgate.core.threat import Brief
 from tailgate.ensemble.battery import opens
-from tailgate.ensemble.points import Point, Points, shares_of, vector_of
+from tailgate.ensemble.points import Memory, Point, Points, at_rest, shares_of, vector_of
 from tailgate.ensemble.space import LONG, NEVER
 
 KINDS = Kind.FDI, Kind.DOS_JAM, Kind.DOS_HOLD, Kind.DROPOUT, Kind.NOISE_JAM, Kind.ECHO_DELAY  # a fresh hold is left to scripts
@@ -50,17 +50,7 @@ class Numbers(NamedTuple):
 
     def remembered(self) -> Memory:
         """Return the memory of the attacks at the start of their episodes."""
-        count = np.zeros(len(self.kind), np.int64)
-        return Memory(self, count > 0, count, np.full(self.target.shape[:2], -np.inf))
-
-
-class Memory(NamedTuple):
-    """The attacks of B episodes and what they remember; every leaf has B first."""
-
-    numbers: Numbers
-    opened: Array  # (B,) bool: the trigger has fired
-    elapsed: Array  # (B,) int64: steps since it first fired
-    lead_speed: Array  # (B, N) at the last look; -inf before the first
+        return at_rest(self, *self.target.shape[:2])
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from tailgate.core.draws import Draws
 from tailgate.core.kinds import EFFECTS
 from tailgate.core.threat import Brief
 from tailgate.ensemble.battery import opens
-from tailgate.ensemble.points import Point, Points, shares_of, vector_of
+from tailgate.ensemble.points import Memory, Point, Points, at_rest, shares_of, vector_of
 
 MODES = 4  # directions that are tried
 SMALLEST, SLOWEST = 0.01, 0.5  # of the bound: the smallest size; of the horizon: the longest growth
@@ -46,8 +46,7 @@ class Numbers(NamedTuple):
 
     def remembered(self) -> Memory:
         """Return the memory of the attacks at the start of their episodes."""
-        count = np.zeros(len(self.size), np.int64)
-        return Memory(Rows(*self[1:]), count > 0, count, np.full((len(count), self.table.shape[2]), -np.inf))
+        return at_rest(Rows(*self[1:]), len(self.size), self.table.shape[2])
 
 
 class Rows(NamedTuple):
@@ -62,15 +61,6 @@ class Rows(NamedTuple):
     start: Array
 
 
-class Memory(NamedTuple):
-    """The attacks of B episodes and what they remember; every leaf has B first."""
-
-    rows: Rows
-    opened: Array  # (B,) bool: the trigger has fired
-    elapsed: Array  # (B,) int64: steps since it first fired
-    lead_speed: Array  # (B, N) at the last look; -inf before the first
-
-
 @dataclass(frozen=True, eq=False)
 class Many:
     """An attack that plays another `ghost` in each row, to the last digits."""
@@ -79,7 +69,7 @@ class Many:
 
     def decide(self, plan: Brief, memory: Memory, view: View, draws: Draws) -> tuple[Memory, Command]:
         """Return the next memory and the commands."""
-        one, count, steps = memory.rows, memory.elapsed, self.table.shape[1]
+        one, count, steps = memory.numbers, memory.elapsed, self.table.shape[1]
         opened = memory.opened | opens(plan, view, one, memory.lead_speed)
         on = opened & view.allowed & (count < one.last)
         share = grown(count, plan.model.dt, one.grow)

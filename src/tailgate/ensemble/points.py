@@ -65,6 +65,21 @@ class Numbers(Protocol):
         """Return the memory of the attacks at the start of their episodes."""
 
 
+class Memory(NamedTuple):
+    """The attacks of B episodes and what they remember; every leaf has B first."""
+
+    numbers: Any  # of the attacks
+    opened: Array  # (B,) bool: the trigger has fired
+    elapsed: Array  # (B,) int64: steps since it first fired
+    lead_speed: Array  # (B, N) at the last look; -inf before the first
+
+
+def at_rest(numbers: object, batch: int, agents: int) -> Memory:
+    """Return the memory of attacks at the start of their episodes."""
+    count = np.zeros(batch, np.int64)
+    return Memory(numbers, count > 0, count, np.full((batch, agents), -np.inf))
+
+
 @dataclass(frozen=True)
 class Points:
     """Attacks of one form that a threat model grants in a scenario."""
